@@ -198,7 +198,17 @@ class System:
     def explain(self, robot: str, service: str) -> Explanation:
         """What `plr explain` says. Raises SystemFailureError."""
         host = self.lab.host("control")
-        argv = [sys.executable, "-m", "controlplane.cli", "explain", robot, service, "--json", "--timeout-s", "20"]
+        argv = [
+            sys.executable,
+            "-m",
+            "controlplane.cli.__main__",
+            "explain",
+            robot,
+            service,
+            "--json",
+            "--timeout-s",
+            "20",
+        ]
         argv += ["--tls-dir", self.tls_dir("operator", IdentityRole.OPERATOR)]
         done = host.run([*argv, "--address", f"{host.address()}:{CONTROL_PORT}"], timeout=60.0)
         if done.returncode:

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from controlplane.cli.text_table import columns
 from controlplane.planning.prospects import least_set, paths_needed
-from controlplane.text_table import columns
 from protos.base.printable import escaped
 
 if TYPE_CHECKING:

@@ -9,7 +9,7 @@ import grpc
 import pytest
 
 from controlplane import turns
-from controlplane.cli import main
+from controlplane.cli.__main__ import main
 from controlplane.config import ControlPlaneConfig
 from controlplane.core.registry.registry import Refusal
 from controlplane.event_log import EventLog

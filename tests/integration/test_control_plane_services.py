@@ -93,13 +93,22 @@ def test_status_as_a_table_and_as_json(plane: ControlPlaneProcess) -> None:
         r.nack(r.expect(PeerSet, lambda message: bool(message.peers)), "not\nthis\tone")
         plane.wait_for_state("robot", SyncState.REJECTED)
         table = subprocess.run(
-            [sys.executable, "-m", "controlplane.cli", "status", "--insecure", "--address", plane.address],
+            [sys.executable, "-m", "controlplane.cli.__main__", "status", "--insecure", "--address", plane.address],
             capture_output=True,
             text=True,
             check=True,
         ).stdout
         as_json = subprocess.run(
-            [sys.executable, "-m", "controlplane.cli", "status", "--insecure", "--address", plane.address, "--json"],
+            [
+                sys.executable,
+                "-m",
+                "controlplane.cli.__main__",
+                "status",
+                "--insecure",
+                "--address",
+                plane.address,
+                "--json",
+            ],
             capture_output=True,
             text=True,
             check=True,
@@ -139,4 +148,4 @@ def test_plr_status_imports_only_what_it_needs(plane: ControlPlaneProcess) -> No
     rest = ("grpc_reflection.v1alpha", "google.protobuf.json_format", "controlplane.ca", "controlplane.planning")
     ours = ("controlplane.config", "controlplane.core", "controlplane.loop", "controlplane.version")
     assert modules & {*heavy, *rest, *ours} == set()
-    assert {"grpc", "controlplane.status_command"} <= modules
+    assert {"grpc", "controlplane.cli.status_command"} <= modules

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import grpc
 import pytest
 
-from controlplane.cli import main
+from controlplane.cli.__main__ import main
 from protos.trust.identity import IdentityRole
 from tests.integration.control_plane_process import HEARTBEAT_S, PATIENCE_S, ControlPlaneProcess, Sidecar, cloud, robot
 from tests.integration.secured_control_plane import SecuredControlPlane

@@ -7,7 +7,7 @@ import json
 import grpc
 import pytest
 
-from controlplane.cli import main
+from controlplane.cli.__main__ import main
 from protos.model import Report
 from protos.plr.v1 import admin_pb2, admin_pb2_grpc
 from tests.integration.control_plane_process import PATIENCE_S, ControlPlaneProcess, cloud, robot

@@ -250,7 +250,7 @@ def test_a_name_that_is_not_the_certificates_is_refused_in_words(plane: SecuredC
 
 
 def plr(*arguments: str) -> subprocess.CompletedProcess[str]:
-    argv = [sys.executable, "-m", "controlplane.cli", *arguments]
+    argv = [sys.executable, "-m", "controlplane.cli.__main__", *arguments]
     return subprocess.run(argv, capture_output=True, text=True, check=False)
 
 

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from controlplane.explanation_text import render
+from controlplane.cli.explanation_text import render
 from protos.model import Role
 from sidecar.core.robot.dispatch.penalties import FIRST_S, LONGEST_S
 from tests.sim.joined_planes import JoinedPlanes

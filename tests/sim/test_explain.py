@@ -6,11 +6,11 @@ from dataclasses import replace
 
 import pytest
 
+from controlplane.cli.explanation_text import render
 from controlplane.core.control.events import Settings
 from controlplane.core.explain.explanation import UnknownNameError
 from controlplane.core.policy.path_rules import PathRule
 from controlplane.core.problem.problem import BlockKey
-from controlplane.explanation_text import render
 from protos.explanation import AlternativeKind, Correlation, Explanation
 from protos.model import (
     Assignment,

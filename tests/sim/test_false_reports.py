@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import pytest
 
+from controlplane.cli.explanation_text import render
 from controlplane.core.control.events import Settings
 from controlplane.core.policy.policy import CallRule, OfferRule, Policy
-from controlplane.explanation_text import render
 from protos.base.histogram import MAX_COUNT, Histogram
 from protos.model import (
     Assignment,

@@ -6,10 +6,10 @@ from typing import TYPE_CHECKING
 
 import pytest
 
+from controlplane.cli.status_table import render
 from controlplane.core.control.events import UnmetNotice
 from controlplane.core.explain.explanation import UnknownNameError
 from controlplane.core.policy.policy import CallRule, OfferRule, Policy
-from controlplane.status_table import render
 from protos.model import NodeName, ServiceName, ServiceSet
 from tests.sim.control_world import SETTLED_S, World
 from tests.unit.controlplane.samples import offer, use

@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from controlplane import cli
 from controlplane.__main__ import main as controlplane
+from controlplane.cli import __main__
 from protos.program.command_line import main as plr
 from sidecar.__main__ import main as sidecar
 from tests.free_ports import free_port
@@ -94,7 +94,7 @@ def test_what_is_no_name_is_bad_usage(capsys: pytest.CaptureFixture[str]) -> Non
 def test_a_mistyped_command_is_told_all_that_there_are(capsys: pytest.CaptureFixture[str]) -> None:
     told = refused(plr, "statuz", capsys=capsys)
     assert all(f"'{name}'" in told for name in ("status", "ca", "doctor", "ping", "bugreport"))
-    assert "COMMAND" in refused(cli.main, "--", "status", capsys=capsys)
+    assert "COMMAND" in refused(__main__.main, "--", "status", capsys=capsys)
 
 
 def test_who_asks_is_told_what_to_name(capsys: pytest.CaptureFixture[str]) -> None:

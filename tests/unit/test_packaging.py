@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 ROOT = Path(__file__).parents[2]
 
 SOLVER = ("ortools", "pandas", "grpc_health", "grpc_reflection")
-_COMMAND = {"protos.program.command_line": ("doctor",), "controlplane.cli": ("status",)}
+_COMMAND = {"protos.program.command_line": ("doctor",), "controlplane.cli.__main__": ("status",)}
 SIDECAR = ("pyroute2", "sdnotify", "zfec", "prometheus_client")
 
 
@@ -94,7 +94,7 @@ def test_a_program_without_its_extra_says_which(module: str, name: str, absent: 
         ("controlplane", "plr-controlplane", "controlplane", "cryptography"),
         ("sidecar", "plr-sidecar", "sidecar", "yaml"),
         ("protos.program.command_line", "plr", "sidecar", "pydantic"),
-        ("controlplane.cli", "plr", "controlplane", "grpc"),
+        ("controlplane.cli.__main__", "plr", "controlplane", "grpc"),
     ],
 )
 def test_a_program_without_a_dependency_says_what_to_install(module: str, name: str, extra: str, absent: str) -> None:
@@ -107,7 +107,7 @@ def test_a_program_without_a_dependency_says_what_to_install(module: str, name: 
 
 @pytest.mark.audit("ops-9")
 def test_planning_without_its_extra_says_which() -> None:
-    done = start("controlplane.cli", ("numpy",), "plan", "--recorded", "none.json")
+    done = start("controlplane.cli.__main__", ("numpy",), "plan", "--recorded", "none.json")
     assert done.returncode == 2
     assert done.stderr == (
         "plr plan: numpy not installed: needs the extra controlplane; in the checkout: pip install '.[controlplane]'\n"

@@ -11,6 +11,7 @@ from dataclasses import replace
 import pytest
 
 from controlplane import turns
+from controlplane.cli.status_table import render
 from controlplane.config import ControlPlaneConfig
 from controlplane.core.control.events import Settings
 from controlplane.core.estimate.fading import FadedHistogram
@@ -32,7 +33,6 @@ from controlplane.fleet_metrics import (
 )
 from controlplane.loop import ControlLoop
 from controlplane.metrics import Metrics
-from controlplane.status_table import render
 from protos.base.histogram import Histogram
 from protos.fleet_events import DepartedSidecar, Why
 from protos.model import (

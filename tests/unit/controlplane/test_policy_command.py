@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from controlplane import cli
+from controlplane.cli import __main__
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -21,7 +21,7 @@ policy:
 
 def check(path: Path, robot: str = "arm-1", service: str = "/arm/grip", cloud: str = "edge-1") -> int:
     command = ["policy", "check", "--config", str(path), "--robot", robot, "--service", service, "--cloud", cloud]
-    return cli.main(command)
+    return __main__.main(command)
 
 
 @pytest.fixture

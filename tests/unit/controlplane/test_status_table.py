@@ -7,8 +7,8 @@ from dataclasses import replace
 
 import pytest
 
-from controlplane import status_table
-from controlplane.status_table import MAX_HINTED, MAX_LINE, MAX_LINES, render
+from controlplane.cli import status_table
+from controlplane.cli.status_table import MAX_HINTED, MAX_LINE, MAX_LINES, render
 from protos.model import (
     Assignment,
     HeldList,

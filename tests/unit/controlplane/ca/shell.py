@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from controlplane import cli
+from controlplane.cli import __main__
 
 
 class Shell:
@@ -27,7 +27,7 @@ class Shell:
 
     def run(self, *arguments: str, code: int = 0) -> str:
         """The same of any `plr`."""
-        assert cli.main(arguments) == code
+        assert __main__.main(arguments) == code
         printed = self._capsys.readouterr()
         lines = printed.err.splitlines(keepends=True)
         self.warnings = [line for line in lines if line.startswith("plr: warning: ")]
@@ -42,7 +42,7 @@ class Shell:
 
     def usage(self, *arguments: str) -> str:
         with pytest.raises(SystemExit) as caught:
-            cli.main(["ca", *arguments])
+            __main__.main(["ca", *arguments])
         assert caught.value.code == 2
         return self._capsys.readouterr().err
 
@@ -50,7 +50,7 @@ class Shell:
 def at_a_terminal(folder: Path, typed: str, *arguments: str) -> tuple[int, str, str]:
     """Run `plr ca` with a terminal at which somebody types; returns its exit code, what it says, and the echo."""
     ours, theirs = pty.openpty()
-    command = [sys.executable, "-m", "controlplane.cli", "ca", *arguments]
+    command = [sys.executable, "-m", "controlplane.cli.__main__", "ca", *arguments]
     environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[4])}
     # A session of its own has no other terminal than this.
     with subprocess.Popen(

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from controlplane import cli
 from controlplane.ca.passphrase import NEW_VARIABLE, VARIABLE
+from controlplane.cli import __main__
 from protos.program.tls_files import load_tls_files
 from protos.trust.identity import CertificateError, IdentityRole
 
@@ -152,7 +152,7 @@ def test_bad_usage_is_told(shell: Shell, arguments: list[str], problem: str) -> 
 )
 def test_every_command_has_help(command: str, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as caught:
-        cli.main(["ca", command, "--help"])
+        __main__.main(["ca", command, "--help"])
     assert caught.value.code == 0
     assert "--dir" in capsys.readouterr().out
 

@@ -10,12 +10,12 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from controlplane import cli
 from controlplane.ca import Authority, AuthorityError, folder
 from controlplane.ca.actions import refuse_taken
 from controlplane.ca.files import write_atomically
 from controlplane.ca.folder import AuthorityFolder
 from controlplane.ca.index import Entry
+from controlplane.cli import __main__
 from protos.base.errors import ConfigError
 from protos.trust.identity import MAX_CA_CERTIFICATES, CertificateError, IdentityRole, Trust
 from tests.unit.controlplane.ca.test_authority import DAY_S, Clock
@@ -149,7 +149,7 @@ def test_what_is_done_is_not_called_refused_when_it_cannot_be_printed(
     for buffering in (-1, 0):
         with io.TextIOWrapper(open("/dev/full", "wb", buffering), write_through=not buffering) as full:
             monkeypatch.setattr(sys, "stdout", full)
-            assert cli.main(["ca", "issue", f"r{buffering}", "--role", "robot", "--dir", ca]) == 0
+            assert __main__.main(["ca", "issue", f"r{buffering}", "--role", "robot", "--dir", ca]) == 0
             monkeypatch.undo()
         error = capsys.readouterr().err.splitlines()[-1]
         assert error.startswith(f"plr: done, but it cannot be printed (No space left on device): issued r{buffering} ")

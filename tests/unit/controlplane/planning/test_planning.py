@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from google.protobuf import json_format
 
-from controlplane.cli import main
+from controlplane.cli.__main__ import main
 from controlplane.planning.prospects import Prospect, least_set, paths_needed
 from controlplane.planning.recorded import RecordedService
 from controlplane.planning.replay import ReplayedTraces, replay

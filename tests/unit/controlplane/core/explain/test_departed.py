@@ -6,11 +6,11 @@ from dataclasses import replace
 
 import pytest
 
+from controlplane.cli.explanation_text import render
 from controlplane.core.control.events import Settings
 from controlplane.core.explain.departed import MAX_DEPARTED, MAX_EXPLAINED, Departed, Departure
 from controlplane.core.explain.explanation import UnknownNameError
 from controlplane.core.policy.policy import CallRule, OfferRule, Policy
-from controlplane.explanation_text import render
 from protos.fleet_events import Why
 from protos.model import Drain, NodeName, OutcomeReport, RemovalReason, Report, Role
 from tests.sim.control_world import SETTLED_S, SimSidecar, World

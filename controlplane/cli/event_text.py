@@ -5,7 +5,7 @@ from __future__ import annotations
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING
 
-from controlplane.text_table import columns, listed
+from controlplane.cli.text_table import columns, listed
 from protos.fleet_events import EventLogState, Why
 
 if TYPE_CHECKING:

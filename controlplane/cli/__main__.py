@@ -73,25 +73,25 @@ def _parser(asked_for: str) -> argparse.ArgumentParser:
 
 
 def _status(commands: Commands, summary: str) -> None:
-    from controlplane import status_command
+    from controlplane.cli import status_command
 
     status_command.add_to(commands, summary)
 
 
 def _explain(commands: Commands, summary: str) -> None:
-    from controlplane import explain_command
+    from controlplane.cli import explain_command
 
     explain_command.add_to(commands, summary)
 
 
 def _events(commands: Commands, summary: str) -> None:
-    from controlplane import events_command
+    from controlplane.cli import events_command
 
     events_command.add_to(commands, summary)
 
 
 def _plan(commands: Commands, summary: str) -> None:
-    from controlplane import plan_command
+    from controlplane.cli import plan_command
 
     plan_command.add_to(commands, summary)
 
@@ -109,13 +109,13 @@ def _request(commands: Commands, summary: str) -> None:
 
 
 def _config(commands: Commands, summary: str) -> None:
-    from controlplane import config_command
+    from controlplane.cli import config_command
 
     config_command.add_to(commands, summary)
 
 
 def _policy(commands: Commands, summary: str) -> None:
-    from controlplane import policy_command
+    from controlplane.cli import policy_command
 
     policy_command.add_to(commands, summary)
 

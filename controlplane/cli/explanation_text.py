@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING
 
-from controlplane.text_table import columns
+from controlplane.cli.text_table import columns
 from protos.explanation import AlternativeKind, Correlation
 
 if TYPE_CHECKING:

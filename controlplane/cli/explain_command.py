@@ -6,8 +6,8 @@ import argparse
 import sys
 from typing import TYPE_CHECKING
 
-from controlplane import explanation_text
-from controlplane.admin_client import AskError, add_options, ask
+from controlplane.cli import explanation_text
+from controlplane.cli.admin_client import AskError, add_options, ask
 from protos.base.names import node_name, service_name
 from protos.convert import explanation_from_proto
 from protos.plr.v1 import admin_pb2

@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING
 
 import grpc
 
-from controlplane import event_text, status_table
-from controlplane.admin_client import EXIT_FAILED, AskError, add_options, ask
+from controlplane.cli import event_text, status_table
+from controlplane.cli.admin_client import EXIT_FAILED, AskError, add_options, ask
 from protos.base.errors import DecodeError
 from protos.base.names import node_name
 from protos.convert import (

@@ -6,7 +6,7 @@ import difflib
 import math
 from typing import TYPE_CHECKING
 
-from controlplane.text_table import columns, listed, shortened
+from controlplane.cli.text_table import columns, listed, shortened
 from protos.model import NO_REVOCATIONS, RevocationSet, Role
 from protos.status import SyncState
 

@@ -1,0 +1,1 @@
+"""`plr`: the operator's commands."""
