@@ -24,7 +24,7 @@ from typing import TYPE_CHECKING
 from protos.program import endings, extras, interpreter
 
 with extras.required("plr-controlplane", "controlplane"):
-    from controlplane.config import load_config, refuse_exposed
+    from controlplane.config.controlplane import load_config, refuse_exposed
     from controlplane.serve.certificate_watch import load_own_files
     from protos.base.errors import ConfigError
     from protos.base.printable import escaped
@@ -37,7 +37,7 @@ with extras.required("plr-controlplane", "controlplane"):
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from controlplane.config import ControlPlaneConfig
+    from controlplane.config.controlplane import ControlPlaneConfig
     from controlplane.serve.server import Addresses
     from protos.program.tls_files import TlsFiles
 
@@ -93,7 +93,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def _warn_of_what_is_legal(config: ControlPlaneConfig) -> None:
     """Say what the log of a start would warn of: a policy that allows nothing is legal, and locks a fleet out."""
-    from controlplane.policy_reload import doubt
+    from controlplane.config.policy_reload import doubt
 
     warnings = [None if config.policy is None else doubt(config.policy.policy())]
     warnings.append(_NO_STUN_SERVERS if config.stun_listen and not config.stun_servers else None)
@@ -149,7 +149,7 @@ def _is_not_a_lost_stream(record: logging.LogRecord) -> bool:
 
 
 async def _run(source: Path, config: ControlPlaneConfig, files: TlsFiles | None) -> None:
-    from controlplane.policy_reload import PolicyReload
+    from controlplane.config.policy_reload import PolicyReload
     from controlplane.serve.server import serve
     from protos.program.notifier import Notifier
 

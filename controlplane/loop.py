@@ -42,7 +42,7 @@ from protos.trust.identity import EXPIRED, REVOKED, CertificateError
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
-    from controlplane.config import ControlPlaneConfig
+    from controlplane.config.controlplane import ControlPlaneConfig
     from controlplane.core.explain.departed import Departed
     from controlplane.core.explain.fleet_view import MemberView
     from controlplane.core.formulation.block import Picture

@@ -14,7 +14,7 @@ from bench.dataplane.section import Findings
 from bench.matcher.crowd import Crowd
 from bench.matcher.fleets import ROOM, flow_optimum, in_regions, random_fleet
 from bench.reporting.tables import Figure, Table
-from controlplane.config import ControlPlaneConfig
+from controlplane.config.controlplane import ControlPlaneConfig
 from controlplane.core.control.schedule import URGENT_DELAY_S
 from controlplane.core.problem.plan import relative_gap
 from controlplane.core.problem.problem import Objective

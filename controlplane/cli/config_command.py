@@ -7,7 +7,7 @@ import subprocess
 import sys
 from typing import TYPE_CHECKING
 
-from controlplane.config import ControlPlaneConfig
+from controlplane.config.controlplane import ControlPlaneConfig
 
 if TYPE_CHECKING:
     import argparse

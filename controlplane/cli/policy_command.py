@@ -6,7 +6,7 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from controlplane.config import load_config
+from controlplane.config.controlplane import load_config
 from controlplane.core.policy.explain import explain
 from protos.base.errors import ConfigError
 from protos.base.names import node_name, service_name

@@ -34,8 +34,8 @@ from protos.trust.clock_floor import ClockFloor
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from controlplane.config import ControlPlaneConfig
-    from controlplane.policy_reload import PolicyReload
+    from controlplane.config.controlplane import ControlPlaneConfig
+    from controlplane.config.policy_reload import PolicyReload
     from protos.program.tls_files import TlsFiles
 
 log = logging.getLogger(__name__)

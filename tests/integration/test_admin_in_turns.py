@@ -10,7 +10,7 @@ import pytest
 
 from controlplane import turns
 from controlplane.cli.__main__ import main
-from controlplane.config import ControlPlaneConfig
+from controlplane.config.controlplane import ControlPlaneConfig
 from controlplane.core.registry.registry import Refusal
 from controlplane.event_log import EventLog
 from controlplane.loop import ControlLoop

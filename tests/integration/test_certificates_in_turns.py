@@ -11,7 +11,7 @@ import pytest
 
 from controlplane import metrics as metrics_module
 from controlplane import turns
-from controlplane.config import ControlPlaneConfig
+from controlplane.config.controlplane import ControlPlaneConfig
 from controlplane.event_log import EventLog
 from controlplane.loop import ControlLoop
 from controlplane.metrics import Metrics

@@ -146,6 +146,6 @@ def test_plr_status_imports_only_what_it_needs(plane: ControlPlaneProcess) -> No
     modules = set(names.split())
     heavy = ("numpy", "pydantic", "yaml", "ortools", "pandas", "matplotlib", "prometheus_client", "grpc_health.v1")
     rest = ("grpc_reflection.v1alpha", "google.protobuf.json_format", "controlplane.ca", "controlplane.planning")
-    ours = ("controlplane.config", "controlplane.core", "controlplane.loop", "controlplane.version")
+    ours = ("controlplane.config.controlplane", "controlplane.core", "controlplane.loop", "controlplane.version")
     assert modules & {*heavy, *rest, *ours} == set()
     assert {"grpc", "controlplane.cli.status_command"} <= modules

@@ -17,7 +17,7 @@ import yaml
 
 from controlplane.__main__ import EXIT_USAGE
 from controlplane.cli.__main__ import main as plr
-from controlplane.config import load_config as load_controlplane_config
+from controlplane.config.controlplane import load_config as load_controlplane_config
 from controlplane.core.control.control import ControlCore
 from controlplane.fleet_metrics import Fleet
 from controlplane.metrics import Metrics

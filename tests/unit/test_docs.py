@@ -17,7 +17,7 @@ from pydantic_core import PydanticUndefined
 from controlplane.ca import key_file, passphrase
 from controlplane.ca.authority import DEFAULT_DAYS
 from controlplane.ca.request import MAX_REQUEST_BYTES
-from controlplane.config import ControlPlaneConfig
+from controlplane.config.controlplane import ControlPlaneConfig
 from controlplane.core.control.control import ControlCore
 from controlplane.fleet_metrics import Fleet
 from controlplane.metrics import Metrics

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
-from controlplane.config import ControlPlaneConfig, load_config, parse_config
+from controlplane.config.controlplane import ControlPlaneConfig, load_config, parse_config
 from controlplane.core.policy.path_rules import PathRule
 from controlplane.core.policy.policy import CallRule, OfferRule, Policy
 from protos.base.errors import ConfigError

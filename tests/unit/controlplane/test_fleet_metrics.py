@@ -12,7 +12,7 @@ import pytest
 
 from controlplane import turns
 from controlplane.cli.status_table import render
-from controlplane.config import ControlPlaneConfig
+from controlplane.config.controlplane import ControlPlaneConfig
 from controlplane.core.control.events import Settings
 from controlplane.core.estimate.fading import FadedHistogram
 from controlplane.core.estimate.network import PathView

@@ -10,14 +10,14 @@ import asyncio
 import logging
 from typing import TYPE_CHECKING
 
-from controlplane.config import load_config
+from controlplane.config.controlplane import load_config
 from protos.base.errors import ConfigError
 
 if TYPE_CHECKING:
     from collections.abc import Callable
     from pathlib import Path
 
-    from controlplane.config import ControlPlaneConfig
+    from controlplane.config.controlplane import ControlPlaneConfig
     from controlplane.core.policy.policy import Policy
     from controlplane.metrics import Metrics
 

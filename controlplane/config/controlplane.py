@@ -6,11 +6,11 @@ from typing import TYPE_CHECKING, Annotated, Literal, Self
 
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, model_validator
 
+from controlplane.config.pattern_fields import InterfacePatterns, NodePatterns, one_or_list
+from controlplane.config.policy import PolicyConfig
 from controlplane.core.control.events import Settings
 from controlplane.core.policy.path_rules import MAX_PATH_RULES, PathRule
 from controlplane.core.problem.problem import Objective
-from controlplane.pattern_fields import InterfacePatterns, NodePatterns, one_or_list
-from controlplane.policy_config import PolicyConfig
 from protos.base.errors import ConfigError
 from protos.base.host_port import is_loopback
 from protos.program.config_fields import (
