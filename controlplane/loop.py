@@ -27,9 +27,9 @@ from controlplane.core.problem.problem import Problem
 from controlplane.core.publish.messages import Close, CloseReason, Send
 from controlplane.core.registry.credential_check import check_claims, check_unproven_claims
 from controlplane.core.registry.registry import Refusal
-from controlplane.fleet_metrics import MAX_GONE, Fleet
 from controlplane.garbage import Collector
-from controlplane.remembered import departures
+from controlplane.observe.fleet_metrics import MAX_GONE, Fleet
+from controlplane.observe.remembered import departures
 from controlplane.serve.earliest_end import EarliestEnd
 from controlplane.serve.mailbox import Mailbox
 from controlplane.turns import Turns
@@ -48,8 +48,8 @@ if TYPE_CHECKING:
     from controlplane.core.formulation.block import Picture
     from controlplane.core.policy.policy import Policy
     from controlplane.core.registry.registry import StreamId
-    from controlplane.event_log import EventLog
-    from controlplane.metrics import Metrics
+    from controlplane.observe.event_log import EventLog
+    from controlplane.observe.metrics import Metrics
     from controlplane.serve.stun_server import StunServer
     from controlplane.serve.tls_gate import Caller
     from controlplane.solver.matcher import Matcher

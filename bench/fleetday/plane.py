@@ -17,8 +17,8 @@ from controlplane.core.control.events import (
 )
 from controlplane.core.publish.messages import Close, CloseReason, Send
 from controlplane.core.registry.registry import Refusal
-from controlplane.event_log import EventLog
-from controlplane.remembered import departures
+from controlplane.observe.event_log import EventLog
+from controlplane.observe.remembered import departures
 from controlplane.solver.matcher import Matcher
 from protos.fleet_events import EventKind
 

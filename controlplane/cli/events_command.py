@@ -10,9 +10,9 @@ from dataclasses import replace
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING
 
-from controlplane import event_lines
 from controlplane.cli import event_text
 from controlplane.cli.admin_client import AskError, add_options, ask
+from controlplane.observe import event_lines
 from protos.base.names import node_name
 from protos.convert import event_list_from_proto, event_query_to_proto
 from protos.fleet_events import EventQuery

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
     from controlplane.config.controlplane import ControlPlaneConfig
     from controlplane.core.policy.policy import Policy
-    from controlplane.metrics import Metrics
+    from controlplane.observe.metrics import Metrics
 
 log = logging.getLogger(__name__)
 

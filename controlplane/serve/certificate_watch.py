@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from controlplane.loop import ControlLoop
-    from controlplane.metrics import Metrics
+    from controlplane.observe.metrics import Metrics
     from controlplane.serve.tls_gate import TlsGate
     from protos.model import NodeName
     from protos.trust.clock_floor import ClockFloor

@@ -17,9 +17,9 @@ from grpc_health.v1 import health, health_pb2, health_pb2_grpc
 from grpc_reflection.v1alpha import reflection
 
 from controlplane.core.registry.registry import MAX_SIDECARS
-from controlplane.event_log import EventLog
 from controlplane.loop import ControlLoop
-from controlplane.metrics import Metrics
+from controlplane.observe.event_log import EventLog
+from controlplane.observe.metrics import Metrics
 from controlplane.serve import admin, service
 from controlplane.serve.access import AccessGuard
 from controlplane.serve.certificate_watch import CertificateKeeper

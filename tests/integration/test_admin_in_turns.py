@@ -12,9 +12,9 @@ from controlplane import turns
 from controlplane.cli.__main__ import main
 from controlplane.config.controlplane import ControlPlaneConfig
 from controlplane.core.registry.registry import Refusal
-from controlplane.event_log import EventLog
 from controlplane.loop import ControlLoop
-from controlplane.metrics import Metrics
+from controlplane.observe.event_log import EventLog
+from controlplane.observe.metrics import Metrics
 from controlplane.serve import admin
 from controlplane.serve.admin import AdminService
 from protos.convert import status_from_proto

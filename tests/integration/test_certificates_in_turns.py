@@ -9,12 +9,12 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from controlplane import metrics as metrics_module
 from controlplane import turns
 from controlplane.config.controlplane import ControlPlaneConfig
-from controlplane.event_log import EventLog
 from controlplane.loop import ControlLoop
-from controlplane.metrics import Metrics
+from controlplane.observe import metrics as metrics_module
+from controlplane.observe.event_log import EventLog
+from controlplane.observe.metrics import Metrics
 from controlplane.serve import certificate_watch
 from controlplane.serve.certificate_watch import CertificateKeeper
 from protos.program.tls_files import load_tls_files

@@ -19,8 +19,8 @@ from controlplane.__main__ import EXIT_USAGE
 from controlplane.cli.__main__ import main as plr
 from controlplane.config.controlplane import load_config as load_controlplane_config
 from controlplane.core.control.control import ControlCore
-from controlplane.fleet_metrics import Fleet
-from controlplane.metrics import Metrics
+from controlplane.observe.fleet_metrics import Fleet
+from controlplane.observe.metrics import Metrics
 from protos.base.host_port import split_host_port
 from protos.model import NodeName, Role
 from protos.trust.identity import Identity, IdentityRole, RevocationList

@@ -6,7 +6,7 @@ import pytest
 
 from controlplane.core.control.events import Settings
 from controlplane.core.policy.policy import CallRule, OfferRule, Policy
-from controlplane.fleet_metrics import families
+from controlplane.observe.fleet_metrics import families
 from protos.model import NodeName, RemovalReason, Report, Role, ServiceSet
 from tests.sim.control_world import SETTLED_S, SimSidecar, World
 from tests.unit.controlplane.samples import PLAN, offer, path, registration

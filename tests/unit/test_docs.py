@@ -19,8 +19,8 @@ from controlplane.ca.authority import DEFAULT_DAYS
 from controlplane.ca.request import MAX_REQUEST_BYTES
 from controlplane.config.controlplane import ControlPlaneConfig
 from controlplane.core.control.control import ControlCore
-from controlplane.fleet_metrics import Fleet
-from controlplane.metrics import Metrics
+from controlplane.observe.fleet_metrics import Fleet
+from controlplane.observe.metrics import Metrics
 from protos.base.histogram import Histogram
 from protos.convert.fields import MAX_CRL_BYTES
 from protos.model import InterfaceName, NodeName, ServiceName

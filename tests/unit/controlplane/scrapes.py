@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from controlplane.fleet_metrics import MAX_GONE, Fleet
+from controlplane.observe.fleet_metrics import MAX_GONE, Fleet
 from protos.model import NodeName
 
 if TYPE_CHECKING:

@@ -11,10 +11,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from controlplane import event_log
-from controlplane.event_lines import decode, encode
-from controlplane.event_log import FILE, EventLog
-from controlplane.remembered import departures
+from controlplane.observe import event_log
+from controlplane.observe.event_lines import decode, encode
+from controlplane.observe.event_log import FILE, EventLog
+from controlplane.observe.remembered import departures
 from protos.base.errors import DecodeError
 from protos.fleet_events import EventKind, EventQuery, FleetEvent, Why
 from protos.model import NodeName, Role

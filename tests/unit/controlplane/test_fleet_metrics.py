@@ -21,8 +21,9 @@ from controlplane.core.explain.departed import Departure
 from controlplane.core.explain.fleet_view import MAX_VIEWED, InterfaceView, MemberView, MissView, ServedView
 from controlplane.core.policy.policy import CallRule, OfferRule, Policy
 from controlplane.core.registry.registry import Refusal
-from controlplane.event_log import EventLog
-from controlplane.fleet_metrics import (
+from controlplane.loop import ControlLoop
+from controlplane.observe.event_log import EventLog
+from controlplane.observe.fleet_metrics import (
     MAX_GONE,
     MAX_SERIES,
     MAX_SERIES_OF_SERVICES,
@@ -31,8 +32,7 @@ from controlplane.fleet_metrics import (
     FleetCollector,
     families,
 )
-from controlplane.loop import ControlLoop
-from controlplane.metrics import Metrics
+from controlplane.observe.metrics import Metrics
 from protos.base.histogram import Histogram
 from protos.fleet_events import DepartedSidecar, Why
 from protos.model import (

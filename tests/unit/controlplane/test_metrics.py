@@ -6,8 +6,8 @@ import time
 
 import prometheus_client
 
-from controlplane.fleet_metrics import REUSED_S, Fleet
-from controlplane.metrics import Metrics
+from controlplane.observe.fleet_metrics import REUSED_S, Fleet
+from controlplane.observe.metrics import Metrics
 from protos.model import OutcomeReport, Report
 from tests.sim.control_world import World
 from tests.unit.controlplane.samples import PLAN

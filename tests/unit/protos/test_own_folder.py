@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from controlplane.event_log import EventLog
+from controlplane.observe.event_log import EventLog
 from protos.fleet_events import EventKind
 from protos.model import NodeName
 from protos.program.own_folder import OwnFolder

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 import prometheus_client
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily
 
-from controlplane.fleet_metrics import FleetCollector
+from controlplane.observe.fleet_metrics import FleetCollector
 from controlplane.serve import handshakes, stream_limits, tls_gate
 from protos.fleet_events import EventLogState
 from protos.model import ResourceKind, Role
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from prometheus_client import Metric
 
     from controlplane.core.control.control import ControlCore
-    from controlplane.fleet_metrics import Fleet
+    from controlplane.observe.fleet_metrics import Fleet
     from controlplane.serve.stun_server import StunServer
     from protos.trust.identity import Identity, RevocationList
 

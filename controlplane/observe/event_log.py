@@ -22,7 +22,7 @@ from collections import deque
 from typing import IO, TYPE_CHECKING
 
 from controlplane.core.explain.event_memory import EventMemory
-from controlplane.event_lines import decode, encode
+from controlplane.observe.event_lines import decode, encode
 from protos.base.errors import DecodeError
 from protos.base.names import clean_text
 from protos.fleet_events import EventKind, EventLogState, FleetEvent
