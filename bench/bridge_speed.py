@@ -34,7 +34,7 @@ from rclpy.serialization import deserialize_message, serialize_message
 from rclpy.type_support import check_for_type_support
 from std_srvs.srv import Empty
 
-from protos.model import NodeName, Role, ServiceName, SessionId
+from protos.model.ids import NodeName, Role, ServiceName, SessionId
 from protos.program import interpreter
 from sidecar.core.base.values import ExecutionId, Priority
 from sidecar.core.rules.service_rule import ServiceRule
@@ -44,7 +44,7 @@ from sidecar.ros import rcl
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
 
-    from protos.model import ServiceOffer
+    from protos.model.members import ServiceOffer
     from sidecar.core.base.values import RejectReason, RequestId
     from sidecar.ros.bridge import RosBridge
 

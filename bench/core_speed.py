@@ -16,20 +16,8 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from bench.null_cipher import null_cipher
-from protos.model import (
-    ALL_CALLS,
-    Candidate,
-    CandidateKind,
-    InterfaceId,
-    InterfaceName,
-    NodeName,
-    Peer,
-    PeerSet,
-    Role,
-    ServiceName,
-    ServiceOffer,
-    Version,
-)
+from protos.model.ids import InterfaceId, InterfaceName, NodeName, Role, ServiceName, Version
+from protos.model.members import ALL_CALLS, Candidate, CandidateKind, Peer, PeerSet, ServiceOffer
 from protos.trust.clock_floor import ClockFloor
 from protos.trust.pair_token import pair_token
 from sidecar.core.base.values import RequestId

@@ -29,10 +29,10 @@ with extras.required("plr-controlplane", "controlplane"):
     from protos.base.errors import ConfigError
     from protos.base.printable import escaped
     from protos.program.arguments import OneLineParser
+    from protos.program.certificate_term import term_problem
     from protos.program.log_lines import line_formatter
     from protos.program.logging_setup import Logging
     from protos.program.version_option import ShowVersion, describe
-    from protos.trust.certificate_term import term_problem
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

@@ -35,8 +35,9 @@ from controlplane.serve.mailbox import Mailbox
 from controlplane.turns import Turns
 from protos.base.token_bucket import TokenBucket
 from protos.convert import status_to_proto
-from protos.fleet_events import EventKind
-from protos.model import NO_REVOCATIONS, RemovalReason, Role
+from protos.model.fleet_events import EventKind
+from protos.model.ids import Role
+from protos.model.members import NO_REVOCATIONS, RemovalReason
 from protos.trust.identity import EXPIRED, REVOKED, CertificateError
 
 if TYPE_CHECKING:
@@ -53,8 +54,10 @@ if TYPE_CHECKING:
     from controlplane.serve.stun_server import StunServer
     from controlplane.serve.tls_gate import Caller
     from controlplane.solver.matcher import Matcher
-    from protos.explanation import Explanation
-    from protos.model import NodeName, Registration, RevocationSet, ServiceName, SidecarMessage
+    from protos.model.explanation import Explanation
+    from protos.model.ids import NodeName, ServiceName
+    from protos.model.members import Registration, RevocationSet
+    from protos.model.stream import SidecarMessage
     from protos.trust.identity import Trust
 
 log = logging.getLogger(__name__)

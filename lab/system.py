@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from lab import Host, HostProcess, Lab
-    from protos.explanation import Explanation
+    from protos.model.explanation import Explanation
 
 CONTROL_PORT = 50051
 STUN_PORT = 3478
@@ -201,7 +201,7 @@ class System:
         argv = [
             sys.executable,
             "-m",
-            "controlplane.cli.__main__",
+            "controlplane.cli",
             "explain",
             robot,
             service,

@@ -20,13 +20,13 @@ from protos.program import commit, endings, extras
 with extras.required("plr-sidecar", "sidecar"):
     from protos.base.errors import ConfigError, StartError
     from protos.base.printable import escaped
-    from protos.model import Role
+    from protos.model.ids import Role
     from protos.program.arguments import OneLineParser
+    from protos.program.certificate_term import term_problem
     from protos.program.log_lines import line_formatter
     from protos.program.logging_setup import Logging
     from protos.program.tls_files import load_tls_files
     from protos.program.version_option import ShowVersion
-    from protos.trust.certificate_term import term_problem
     from sidecar.config.sidecar import SidecarConfig, config_schema, load_config, refuse_exposed
     from sidecar.ros import environment
     from sidecar.stop_request import StopRequest
@@ -34,7 +34,7 @@ with extras.required("plr-sidecar", "sidecar"):
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from protos.trust.certificate_term import TermProblem
+    from protos.program.certificate_term import TermProblem
 
 log = logging.getLogger("sidecar.main")
 

@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING, Protocol
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from protos.model import ServiceName, ServiceOffer, SessionId
+    from protos.model.ids import ServiceName, SessionId
+    from protos.model.members import ServiceOffer
     from sidecar.core.base.values import ExecutionId, RejectReason, RequestId
     from sidecar.core.seam.application import ApplicationEvent
 

@@ -12,18 +12,9 @@ from typing import TYPE_CHECKING
 
 from protos.base.errors import StartError
 from protos.base.host_port import split_host_port
-from protos.model import (
-    MAX_UNMET,
-    OLDEST_PROTOCOL_VERSION,
-    PROTOCOL_VERSION,
-    CandidateKind,
-    Registration,
-    ResourceKind,
-    Role,
-    ServiceName,
-    ServiceSet,
-    Version,
-)
+from protos.model.ids import OLDEST_PROTOCOL_VERSION, PROTOCOL_VERSION, Role, ServiceName, Version
+from protos.model.members import MAX_UNMET, CandidateKind, Registration, ServiceSet
+from protos.model.stream import ResourceKind
 from protos.program import interpreter
 from protos.program.notifier import Notifier
 from protos.program.tls_files import TlsWatch, load_tls_files
@@ -48,16 +39,11 @@ from sidecar.state.store import StateDirError, StateStore
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from protos.model import (
-        Assignment,
-        Candidate,
-        InterfaceName,
-        MappingSet,
-        NodeName,
-        PeerSet,
-        Report,
-        Welcome,
-    )
+    from protos.model.ids import InterfaceName, NodeName
+    from protos.model.mapping import Assignment, MappingSet
+    from protos.model.members import Candidate, PeerSet
+    from protos.model.report import Report
+    from protos.model.stream import Welcome
     from protos.program.metrics_server import MetricsServer
     from protos.program.tls_files import TlsFiles
     from sidecar.config.sidecar import SidecarConfig

@@ -8,7 +8,7 @@ from dataclasses import replace
 from functools import lru_cache
 from typing import TYPE_CHECKING
 
-from protos.model import NodeName, Peer, Role, SessionId
+from protos.model.ids import NodeName, Role, SessionId
 from protos.trust.credential import Aead, SessionCredential
 from sidecar.core.crypto.aead import NONCE_BYTES, TAG_BYTES
 from sidecar.core.crypto.session import OwnSession, public_key
@@ -17,6 +17,7 @@ from sidecar.core.wire.frame import HEADER_BYTES, PHASE_FLAG, Header, encode_hea
 if TYPE_CHECKING:
     import random
 
+    from protos.model.members import Peer
     from sidecar.core.path.keys import PathKeys, SealingKeys
 
 

@@ -21,7 +21,7 @@ from bench.control.crowd import Crowd
 from bench.control.member import SERVICE, Member
 from bench.control.plane import Plane
 from controlplane.ca import Authority
-from protos.model import InterfaceName, NodeName, Role
+from protos.model.ids import InterfaceName, NodeName, Role
 from protos.trust.identity import IdentityRole
 
 if TYPE_CHECKING:

@@ -18,19 +18,10 @@ import grpc
 
 from controlplane.core.overload.pacing import Pacing
 from protos.convert import control_message_to_proto, parse_sidecar_message
-from protos.model import (
-    Assignment,
-    InterfaceName,
-    MappingSet,
-    NodeName,
-    PeerSet,
-    Registration,
-    Role,
-    ServiceMapping,
-    ServiceName,
-    Version,
-    Welcome,
-)
+from protos.model.ids import InterfaceName, NodeName, Role, ServiceName, Version
+from protos.model.mapping import Assignment, MappingSet, ServiceMapping
+from protos.model.members import PeerSet, Registration
+from protos.model.stream import Welcome
 from protos.plr.v1 import control_pb2
 
 if TYPE_CHECKING:

@@ -23,7 +23,7 @@ from bench.pressure import CpuPressure
 from bench.reporting.machine import machine
 from bench.reporting.terminal import show_verdicts
 from controlplane.ca import Authority
-from protos.model import NodeName, Role
+from protos.model.ids import NodeName, Role
 from protos.trust.identity import IdentityRole
 
 if TYPE_CHECKING:

@@ -15,7 +15,8 @@ from typing import TYPE_CHECKING
 import grpc
 
 from protos.convert import control_message_from_proto, sidecar_message_to_proto
-from protos.model import MappingSet, PeerSet, Role
+from protos.model.ids import Role
+from protos.model.mapping import MappingSet
 from protos.plr.v1 import control_pb2_grpc
 from protos.trust.identity import CONTROL_PLANE_DNS
 from sidecar.control.channel import REFUSALS
@@ -26,7 +27,8 @@ if TYPE_CHECKING:
     from collections.abc import Iterable
 
     from bench.control.member import Member
-    from protos.model import NodeName
+    from protos.model.ids import NodeName
+    from protos.model.members import PeerSet
     from protos.plr.v1 import control_pb2
     from sidecar.core.control.session import ControlSession
 

@@ -7,25 +7,17 @@ import time
 from typing import TYPE_CHECKING
 
 from protos.base.histogram import Histogram
-from protos.model import (
-    PROTOCOL_VERSION,
+from protos.model.ids import PROTOCOL_VERSION, InterfaceId, InterfaceName, NodeName, Role, ServiceName
+from protos.model.members import (
     Candidate,
     CandidateKind,
     CandidateSet,
-    InterfaceId,
-    InterfaceName,
-    LatencyReport,
-    NodeName,
-    OutcomeReport,
-    PathReport,
     Registration,
-    Report,
-    Role,
-    ServiceName,
     ServiceOffer,
     ServiceSet,
     ServiceUse,
 )
+from protos.model.report import LatencyReport, OutcomeReport, PathReport, Report
 from protos.trust.candidate_signature import sign_candidates
 from protos.trust.credential import Aead, SessionCredential, session_number
 from sidecar.core.control.session import ControlSession
@@ -34,7 +26,8 @@ if TYPE_CHECKING:
     import random
 
     from controlplane.ca.certificates import Issued
-    from protos.model import Assignment, SessionId
+    from protos.model.ids import SessionId
+    from protos.model.mapping import Assignment
 
 SERVICE = ServiceName("/plan_path")
 TYPE = "bench/srv/Plan"

@@ -147,7 +147,7 @@ class Plane:
 
     def status_s(self) -> float:
         """How long `plr status` takes, from its start to its end."""
-        command = [sys.executable, "-m", "controlplane.cli.__main__", "status", "--address", self.target]
+        command = [sys.executable, "-m", "controlplane.cli", "status", "--address", self.target]
         began = time.monotonic()
         subprocess.run(
             [*command, "--tls-dir", str(self._operator)], check=True, stdout=subprocess.DEVNULL, timeout=PATIENCE_S

@@ -11,8 +11,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from protos.model import NO_CALLS, ResourceKind, Role, Version
-from protos.status import SyncState
+from protos.model.ids import Role, Version
+from protos.model.members import NO_CALLS
+from protos.model.status import SyncState
+from protos.model.stream import ResourceKind
 from protos.trust.pair_token import pair_token
 
 if TYPE_CHECKING:
@@ -22,7 +24,9 @@ if TYPE_CHECKING:
     from bench.fleetday.plane import Plane
     from controlplane.core.control.control import ControlCore
     from controlplane.core.policy.policy import Policy
-    from protos.model import NodeName, Peer, ServiceMapping
+    from protos.model.ids import NodeName
+    from protos.model.mapping import ServiceMapping
+    from protos.model.members import Peer
 
 SETTLES_S = 60.0
 """After a change of a member, or of what keeps it from hearing of one, until all who can hear of it have: twice the

@@ -23,13 +23,14 @@ from controlplane.core.policy.policy import CallRule, OfferRule, Policy
 from controlplane.core.publish.history import MAX_CHANGES, MAX_HISTORIES
 from controlplane.core.publish.publisher import MAX_GONE_SNAPSHOTS
 from controlplane.core.registry.registry import MAX_REMEMBERED_REMOVALS
-from protos.model import InterfaceName, NodeName, RemovalReason, Role, ServiceName, ServiceOffer, ServiceSet, ServiceUse
+from protos.model.ids import InterfaceName, NodeName, Role, ServiceName
+from protos.model.members import RemovalReason, ServiceOffer, ServiceSet, ServiceUse
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
     from pathlib import Path
 
-    from protos.model import Address
+    from protos.model.ids import Address
 
 HOUR_S = 3600.0
 START = 1000.0

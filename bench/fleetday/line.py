@@ -14,7 +14,8 @@ from protos.convert import (
     parse_sidecar_message,
     sidecar_message_to_proto,
 )
-from protos.model import Heartbeat, PeerSet, Registration
+from protos.model.members import PeerSet, Registration
+from protos.model.stream import Heartbeat
 
 if TYPE_CHECKING:
     import random
@@ -23,7 +24,7 @@ if TYPE_CHECKING:
     from bench.fleetday.plane import Plane
     from bench.fleetday.timeline import Timeline
     from controlplane.core.registry.registry import StreamId
-    from protos.model import ControlMessage, SidecarMessage
+    from protos.model.stream import ControlMessage, SidecarMessage
 
 IN_FLIGHT = 2
 """Messages that a connection's buffers hold; what else is to be written waits in the mailbox, where newer ones come in

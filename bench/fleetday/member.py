@@ -8,27 +8,10 @@ from typing import TYPE_CHECKING
 from bench.fleetday.held import Held
 from bench.fleetday.line import Line
 from protos.base.histogram import Histogram
-from protos.model import (
-    PROTOCOL_VERSION,
-    Candidate,
-    CandidateKind,
-    CandidateSet,
-    InterfaceId,
-    InterfaceName,
-    LatencyReport,
-    MappingSet,
-    OutcomeReport,
-    PathReport,
-    PeerSet,
-    Registration,
-    Report,
-    ResourceKind,
-    Role,
-    ServiceSet,
-    SessionId,
-    Version,
-    Welcome,
-)
+from protos.model.ids import PROTOCOL_VERSION, InterfaceId, InterfaceName, Role, SessionId, Version
+from protos.model.members import Candidate, CandidateKind, CandidateSet, PeerSet, Registration, ServiceSet
+from protos.model.report import LatencyReport, OutcomeReport, PathReport, Report
+from protos.model.stream import ResourceKind, Welcome
 from sidecar.core.base.report_scope import ReportScope
 from sidecar.core.control.session import Apply, ControlSession, ControlState
 
@@ -37,7 +20,9 @@ if TYPE_CHECKING:
 
     from bench.fleetday.plane import Plane
     from bench.fleetday.timeline import Timeline
-    from protos.model import Address, ControlMessage, InterfaceName, NodeName
+    from protos.model.ids import Address, InterfaceName, NodeName
+    from protos.model.mapping import MappingSet
+    from protos.model.stream import ControlMessage
 
 NOTICES_S = (10.0, 40.0)
 """Keepalives find a connection that died without a word within this time."""

@@ -20,7 +20,7 @@ from controlplane.core.registry.registry import Refusal
 from controlplane.observe.event_log import EventLog
 from controlplane.observe.remembered import departures
 from controlplane.solver.matcher import Matcher
-from protos.fleet_events import EventKind
+from protos.model.fleet_events import EventKind
 
 if TYPE_CHECKING:
     import random
@@ -33,7 +33,9 @@ if TYPE_CHECKING:
     from controlplane.core.policy.policy import Policy
     from controlplane.core.problem.plan import Plan
     from controlplane.core.registry.registry import StreamId
-    from protos.model import Heartbeat, NodeName, Registration, RemovalReason, SidecarMessage
+    from protos.model.ids import NodeName
+    from protos.model.members import Registration, RemovalReason
+    from protos.model.stream import Heartbeat, SidecarMessage
 
 TURN_S = 0.02
 """From one turn of the loop to the next at least, while one follows the other."""

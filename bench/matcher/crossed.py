@@ -20,7 +20,8 @@ from bench.matcher.races import (
     Races,
 )
 from controlplane.planning.fifo import FifoLink
-from protos.model import Assignment, InterfaceName, NodeName
+from protos.model.ids import InterfaceName, NodeName
+from protos.model.mapping import Assignment
 
 if TYPE_CHECKING:
     from bench.matcher.races import Workload

@@ -12,29 +12,18 @@ from controlplane.core.control.events import Settings
 from controlplane.core.publish.messages import Send
 from controlplane.solver.matcher import Matcher
 from protos.base.histogram import Histogram
-from protos.model import (
-    PROTOCOL_VERSION,
-    Assignment,
+from protos.model.ids import PROTOCOL_VERSION, InterfaceId, InterfaceName, NodeName, Role, ServiceName, SessionId
+from protos.model.mapping import Assignment, MappingSet
+from protos.model.members import (
     Candidate,
     CandidateKind,
     CandidateSet,
-    InterfaceId,
-    InterfaceName,
-    JointReport,
-    LatencyReport,
-    MappingSet,
-    NodeName,
-    OutcomeReport,
-    PathReport,
     Registration,
-    Report,
-    Role,
-    ServiceName,
     ServiceOffer,
     ServiceSet,
     ServiceUse,
-    SessionId,
 )
+from protos.model.report import JointReport, LatencyReport, OutcomeReport, PathReport, Report
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterator

@@ -11,16 +11,9 @@ from typing import TYPE_CHECKING
 
 from protos.base.histogram import Histogram
 from protos.base.size_class import size_class
-from protos.model import (
-    Assignment,
-    InterfaceName,
-    JointReport,
-    LatencyReport,
-    NodeName,
-    PathReport,
-    Report,
-    ServiceName,
-)
+from protos.model.ids import InterfaceName, NodeName, ServiceName
+from protos.model.mapping import Assignment
+from protos.model.report import JointReport, LatencyReport, PathReport, Report
 from sidecar.core.base.request_id import OBSERVED_ONE_IN
 
 if TYPE_CHECKING:

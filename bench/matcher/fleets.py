@@ -15,7 +15,7 @@ from ortools.graph.python import min_cost_flow
 
 from controlplane.core.problem.objectives import epsilon_matrix, path_costs
 from controlplane.core.problem.problem import Block, BlockKey, FleetKey, Objective, Path, Problem
-from protos.model import InterfaceName, NodeName, ServiceName
+from protos.model.ids import InterfaceName, NodeName, ServiceName
 
 SERVICE = ServiceName("/bench")
 ROOM = 1.1

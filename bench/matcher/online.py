@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
     from bench.matcher.races import Races
-    from protos.model import Assignment, ServiceMapping
+    from protos.model.mapping import Assignment, ServiceMapping
 
 RIVALS = ("best fixed", "random", "round robin", "lowest mean RTT")
 Mapping = tuple[int, ...]

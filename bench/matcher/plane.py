@@ -11,28 +11,25 @@ from controlplane.core.control.events import Settings
 from controlplane.core.publish.messages import Send
 from controlplane.core.registry.registry import Refusal
 from controlplane.solver.matcher import Matcher
-from protos.model import (
-    PROTOCOL_VERSION,
+from protos.model.ids import PROTOCOL_VERSION, InterfaceId, InterfaceName, Role, SessionId
+from protos.model.mapping import MappingSet, ServiceMapping
+from protos.model.members import (
     Candidate,
     CandidateKind,
     CandidateSet,
-    InterfaceId,
-    InterfaceName,
-    MappingSet,
     Registration,
-    Role,
-    ServiceMapping,
     ServiceOffer,
     ServiceSet,
     ServiceUse,
-    SessionId,
 )
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from controlplane.core.registry.registry import StreamId
-    from protos.model import Assignment, NodeName, SidecarMessage
+    from protos.model.ids import NodeName
+    from protos.model.mapping import Assignment
+    from protos.model.stream import SidecarMessage
 
 FOREVER_S = 1e9
 JOINED_S = -2.0

@@ -21,7 +21,7 @@ from controlplane.ca.certificates import (
 from controlplane.ca.files import write_tls_files
 from controlplane.ca.index import Entry, Record
 from controlplane.ca.request import fingerprint
-from protos.base.names import node_name
+from protos.model.names import node_name
 from protos.trust.identity import MAX_CA_CERTIFICATES
 
 if TYPE_CHECKING:

@@ -13,8 +13,8 @@ from controlplane.ca import actions, request_actions
 from controlplane.ca.authority import DEFAULT_CA_DAYS, DEFAULT_DAYS, AuthorityError
 from controlplane.ca.passphrase import NEW_VARIABLE, VARIABLE
 from protos.base.errors import ConfigError, DecodeError
-from protos.base.names import node_name, text
 from protos.base.printable import escaped
+from protos.model.names import node_name, text
 from protos.program import endings
 from protos.program.arguments import checked
 from protos.trust.identity import IdentityRole

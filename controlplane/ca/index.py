@@ -18,7 +18,7 @@ from pydantic import (
 )
 
 from protos.base.errors import ConfigError
-from protos.base.names import node_name
+from protos.model.names import node_name
 from protos.program.config_file import key_path
 from protos.trust.identity import IdentityRole
 
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterable
     from pathlib import Path
 
-    from protos.model import NodeName
+    from protos.model.ids import NodeName
 
 
 LAST_MOMENT = 253_402_300_799.0

@@ -27,7 +27,7 @@ from protos.base.errors import DecodeError
 from protos.trust.identity import SIGNATURES, name_and_role
 
 if TYPE_CHECKING:
-    from protos.model import NodeName
+    from protos.model.ids import NodeName
     from protos.trust.identity import IdentityRole
 
 REQUEST_FILE = "request.pem"

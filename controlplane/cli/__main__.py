@@ -138,7 +138,7 @@ _ON_A_NODE = {
     "ping": "on a robot or a server: how long each path to a peer takes",
     "bugreport": "on a robot or a server: a tar file for whoever helps",
 }
-"""The sidecar's, which never come here (protos/program/command_line.py): to be listed, and found by who mistypes one."""
+"""The sidecar's, which never come here (`protos.program.command_line`): to be listed, and found by who mistypes one."""
 
 
 if __name__ == "__main__":

@@ -6,12 +6,12 @@ from datetime import UTC, datetime
 from typing import TYPE_CHECKING
 
 from controlplane.cli.text_table import columns, listed
-from protos.fleet_events import EventLogState, Why
+from protos.model.fleet_events import EventLogState, Why
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
-    from protos.fleet_events import DepartedSidecar, FleetEvent
+    from protos.model.fleet_events import DepartedSidecar, FleetEvent
 
 SHOWN = 20
 """Sidecars that are gone in the text of a status."""

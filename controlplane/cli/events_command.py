@@ -13,13 +13,13 @@ from typing import TYPE_CHECKING
 from controlplane.cli import event_text
 from controlplane.cli.admin_client import AskError, add_options, ask
 from controlplane.observe import event_lines
-from protos.base.names import node_name
 from protos.convert import event_list_from_proto, event_query_to_proto
-from protos.fleet_events import EventQuery
+from protos.model.fleet_events import EventQuery
+from protos.model.names import node_name
 from protos.program.arguments import checked, whole
 
 if TYPE_CHECKING:
-    from protos.fleet_events import EventList
+    from protos.model.fleet_events import EventList
     from protos.program.arguments import Commands
 
 EXIT_OK = 0

@@ -8,13 +8,13 @@ from typing import TYPE_CHECKING
 
 from controlplane.cli import explanation_text
 from controlplane.cli.admin_client import AskError, add_options, ask
-from protos.base.names import node_name, service_name
 from protos.convert import explanation_from_proto
+from protos.model.names import node_name, service_name
 from protos.plr.v1 import admin_pb2
 from protos.program.arguments import checked
 
 if TYPE_CHECKING:
-    from protos.explanation import Explanation
+    from protos.model.explanation import Explanation
     from protos.plr.v1 import admin_pb2_grpc
     from protos.program.arguments import Commands
 

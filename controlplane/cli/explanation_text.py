@@ -6,14 +6,14 @@ import math
 from typing import TYPE_CHECKING
 
 from controlplane.cli.text_table import columns
-from protos.explanation import AlternativeKind, Correlation
+from protos.model.explanation import AlternativeKind, Correlation
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
     from protos.base.histogram import Histogram
-    from protos.explanation import Alternative, Explanation, JointExplanation, MappingChange, PairExplanation
-    from protos.model import Assignment
+    from protos.model.explanation import Alternative, Explanation, JointExplanation, MappingChange, PairExplanation
+    from protos.model.mapping import Assignment
 
 LEAST_SHOWN = 1e-9
 """No smaller probability is worth telling: it would take years to see one miss."""

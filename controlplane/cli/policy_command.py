@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from controlplane.config.controlplane import load_config
 from controlplane.core.policy.explain import explain
 from protos.base.errors import ConfigError
-from protos.base.names import node_name, service_name
+from protos.model.names import node_name, service_name
 from protos.program.arguments import checked
 
 if TYPE_CHECKING:

@@ -13,7 +13,6 @@ import grpc
 from controlplane.cli import event_text, status_table
 from controlplane.cli.admin_client import EXIT_FAILED, AskError, add_options, ask
 from protos.base.errors import DecodeError
-from protos.base.names import node_name
 from protos.convert import (
     departed_from_proto,
     events_from_proto,
@@ -23,18 +22,19 @@ from protos.convert import (
     status_query_to_proto,
 )
 from protos.convert.fields import MAX_SIDECARS
+from protos.model.names import node_name
+from protos.model.status import StatusQuery
 from protos.plr.v1 import admin_pb2
 from protos.program.arguments import checked
-from protos.status import StatusQuery
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
 
-    from protos.fleet_events import DepartedSidecar
-    from protos.model import NodeName
+    from protos.model.fleet_events import DepartedSidecar
+    from protos.model.ids import NodeName
+    from protos.model.status import SidecarStatus
     from protos.plr.v1 import admin_pb2_grpc
     from protos.program.arguments import Commands
-    from protos.status import SidecarStatus
 
 EXIT_OK = 0
 

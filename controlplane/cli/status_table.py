@@ -7,14 +7,16 @@ import math
 from typing import TYPE_CHECKING
 
 from controlplane.cli.text_table import columns, listed, shortened
-from protos.model import NO_REVOCATIONS, RevocationSet, Role
-from protos.status import SyncState
+from protos.model.ids import Role
+from protos.model.members import NO_REVOCATIONS, RevocationSet
+from protos.model.status import SyncState
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 
-    from protos.model import PathReport, ServiceMapping
-    from protos.status import ResourceStatus, SidecarStatus
+    from protos.model.mapping import ServiceMapping
+    from protos.model.report import PathReport
+    from protos.model.status import ResourceStatus, SidecarStatus
 
 MAX_LINES = 256
 """On one sidecar: what it says that it offers, lacks or reaches must not hide the others."""

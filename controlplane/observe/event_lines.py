@@ -7,9 +7,9 @@ from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from protos.base.errors import DecodeError
-from protos.base.names import clean_text, node_name
-from protos.fleet_events import EventKind, FleetEvent, Why
-from protos.model import Role
+from protos.model.fleet_events import EventKind, FleetEvent, Why
+from protos.model.ids import Role
+from protos.model.names import clean_text, node_name
 
 if TYPE_CHECKING:
     import enum

@@ -24,8 +24,8 @@ from typing import IO, TYPE_CHECKING
 from controlplane.core.explain.event_memory import EventMemory
 from controlplane.observe.event_lines import decode, encode
 from protos.base.errors import DecodeError
-from protos.base.names import clean_text
-from protos.fleet_events import EventKind, EventLogState, FleetEvent
+from protos.model.fleet_events import EventKind, EventLogState, FleetEvent
+from protos.model.names import clean_text
 from protos.program import own_folder
 from protos.program.own_folder import OwnFolder
 
@@ -33,8 +33,8 @@ if TYPE_CHECKING:
     from collections.abc import Callable
     from pathlib import Path
 
-    from protos.fleet_events import EventQuery, Why
-    from protos.model import NodeName, Role
+    from protos.model.fleet_events import EventQuery, Why
+    from protos.model.ids import NodeName, Role
 
 log = logging.getLogger(__name__)
 

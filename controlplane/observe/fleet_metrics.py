@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, cast
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, InfoMetricFamily
 from prometheus_client.samples import Sample
 
-from protos.model import Role
+from protos.model.ids import Role
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
@@ -27,8 +27,8 @@ if TYPE_CHECKING:
     from prometheus_client import Metric
 
     from controlplane.core.explain.fleet_view import MemberView, MissView, ServedView
-    from protos.fleet_events import DepartedSidecar
-    from protos.model import NodeName
+    from protos.model.fleet_events import DepartedSidecar
+    from protos.model.ids import NodeName
 
 MAX_SERIES = 100_000
 """Of all members."""

@@ -16,12 +16,13 @@ from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily
 
 from controlplane.observe.fleet_metrics import FleetCollector
 from controlplane.serve import handshakes, stream_limits, tls_gate
-from protos.fleet_events import EventLogState
-from protos.model import ResourceKind, Role
+from protos.model.fleet_events import EventLogState
+from protos.model.ids import Role
+from protos.model.status import SyncState
+from protos.model.stream import ResourceKind
 from protos.program.metrics_server import MetricsServer
-from protos.revocation_views import revocation_gauges
-from protos.status import SyncState
 from protos.trust import identity
+from protos.trust.revocation_views import revocation_gauges
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping, Sequence

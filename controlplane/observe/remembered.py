@@ -5,12 +5,12 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from controlplane.core.explain.departed import Departure
-from protos.fleet_events import EventKind, FleetEvent, Why
+from protos.model.fleet_events import EventKind, FleetEvent, Why
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from protos.model import NodeName
+    from protos.model.ids import NodeName
 
 
 def departures(

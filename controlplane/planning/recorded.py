@@ -16,7 +16,7 @@ from controlplane.core.problem.problem import Block, BlockKey, Objective
 from controlplane.planning.prospects import Prospect
 from protos.base.errors import DecodeError
 from protos.convert import explanation_from_proto
-from protos.explanation import SAMPLE
+from protos.model.explanation import SAMPLE
 from protos.plr.v1 import admin_pb2
 from protos.program.regular_file import read_regular
 
@@ -29,8 +29,8 @@ if TYPE_CHECKING:
     from controlplane.core.problem.problem import Choice
     from controlplane.core.problem.problem import Path as PathIndex
     from protos.base.histogram import Histogram
-    from protos.explanation import Explanation, PairExplanation
-    from protos.model import Assignment
+    from protos.model.explanation import Explanation, PairExplanation
+    from protos.model.mapping import Assignment
 
 MAX_CHOICES = 20_000
 """Sets looked at: beyond, only the servers with the least epsilon of each interface are."""

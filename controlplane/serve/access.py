@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import grpc
 
-from protos.trust.certificate_term import with_remedy
+from protos.program.certificate_term import with_remedy
 from protos.trust.identity import WRONG_ROLE, IdentityRole
 
 if TYPE_CHECKING:

@@ -23,8 +23,8 @@ from protos.convert import (
     status_query_from_proto,
     status_to_proto,
 )
+from protos.model.status import StatusQuery
 from protos.plr.v1 import admin_pb2
-from protos.status import StatusQuery
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator

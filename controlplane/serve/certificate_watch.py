@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, NoReturn
 from protos.base.errors import ConfigError
 from protos.convert.fields import MAX_CRL_BYTES
 from protos.program.tls_files import POLL_INTERVAL_S, TlsFiles, TlsWatch, load_tls_files
-from protos.revocation_views import revocation_set
 from protos.trust.identity import IdentityRole
+from protos.trust.revocation_views import revocation_set
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from controlplane.loop import ControlLoop
     from controlplane.observe.metrics import Metrics
     from controlplane.serve.tls_gate import TlsGate
-    from protos.model import NodeName
+    from protos.model.ids import NodeName
     from protos.trust.clock_floor import ClockFloor
 
 log = logging.getLogger(__name__)

@@ -8,12 +8,14 @@ from __future__ import annotations
 import asyncio
 from typing import TYPE_CHECKING
 
-from protos.model import MappingSet, PeerSet, Welcome
-from protos.peer_changes import put_together
+from protos.model.mapping import MappingSet
+from protos.model.members import PeerSet
+from protos.model.peer_changes import put_together
+from protos.model.stream import Welcome
 
 if TYPE_CHECKING:
     from controlplane.core.publish.messages import CloseReason
-    from protos.model import ControlMessage
+    from protos.model.stream import ControlMessage
 
 _ORDER = (Welcome, PeerSet, MappingSet)
 """A mapping goes after the peers it names."""

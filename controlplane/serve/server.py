@@ -27,7 +27,7 @@ from controlplane.serve.stream_limits import MAX_MESSAGE_BYTES, MAX_STREAMS_PER_
 from controlplane.serve.stun_server import start_stun_server
 from controlplane.serve.tls_gate import TlsGate
 from protos.base.host_port import split_host_port
-from protos.fleet_events import EventKind
+from protos.model.fleet_events import EventKind
 from protos.program.version_option import describe
 from protos.trust.clock_floor import ClockFloor
 

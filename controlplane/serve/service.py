@@ -20,7 +20,6 @@ from controlplane.serve.stream_limits import (
     StreamRate,
 )
 from protos.base.errors import DecodeError, UnknownKindError
-from protos.base.protocol_versions import Spoken, refusal
 from protos.convert import (
     parse_in_parts,
     parse_sidecar_message,
@@ -28,7 +27,10 @@ from protos.convert import (
     sidecar_message_from_proto,
 )
 from protos.convert.reports import report_entries
-from protos.model import Heartbeat, Registration, Report
+from protos.model.members import Registration
+from protos.model.protocol_versions import Spoken, refusal
+from protos.model.report import Report
+from protos.model.stream import Heartbeat
 from protos.plr.v1 import control_pb2
 
 if TYPE_CHECKING:
@@ -36,7 +38,8 @@ if TYPE_CHECKING:
     from controlplane.loop import ControlLoop
     from controlplane.serve.mailbox import Mailbox
     from controlplane.serve.tls_gate import Caller, TlsGate
-    from protos.model import NodeName, SidecarMessage
+    from protos.model.ids import NodeName
+    from protos.model.stream import SidecarMessage
 
     Context = grpc.aio.ServicerContext[bytes, bytes]
 

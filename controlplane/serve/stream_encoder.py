@@ -11,13 +11,14 @@ from typing import TYPE_CHECKING
 from controlplane.core.publish.told_peers import ToldPeers
 from protos.convert.control import control_message_to_proto, peer_set_header_to_proto
 from protos.convert.types import peer_to_proto
-from protos.model import TOKEN_BYTES, PeerSet
+from protos.model.members import TOKEN_BYTES, PeerSet
 from protos.plr.v1 import control_pb2, types_pb2
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from protos.model import ControlMessage, Peer
+    from protos.model.members import Peer
+    from protos.model.stream import ControlMessage
 
 PART_BYTES = 256 << 10
 """Of a set's peers in one message: some 350, a few milliseconds of the loop, and far below gRPC's 4 MiB."""

@@ -30,7 +30,7 @@ from protos.stun.codec import MAX_MESSAGE_BYTES
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from protos.model import Address
+    from protos.model.ids import Address
 
 log = logging.getLogger(__name__)
 

@@ -36,7 +36,7 @@ from protos.trust.identity import CertificateError, IdentityRole
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
-    from protos.model import NodeName
+    from protos.model.ids import NodeName
     from protos.program.tls_files import TlsFiles
     from protos.trust.clock_floor import ClockFloor
     from protos.trust.identity import Identity, Trust

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 from cryptography.hazmat.primitives.asymmetric.x25519 import X25519PrivateKey, X25519PublicKey
 
-from protos.model import InterfaceId, Role
+from protos.model.ids import InterfaceId, Role
 from protos.trust.credential import decode_credential, session_number
 from protos.trust.pair_token import pair_token
 from sidecar.core.crypto.aead import TAG_BYTES

@@ -13,34 +13,24 @@ from typing import TYPE_CHECKING
 from lab.attacker.hostile_link import ESCAPES
 from lab.attacker.orders import Stage
 from protos.base.histogram import MAX_COUNT, Histogram
-from protos.model import (
+from protos.model.ids import InterfaceId, InterfaceName, NodeName, Role, ServiceName, Version
+from protos.model.members import (
     MAX_CANDIDATES_OF_INTERFACE,
     Candidate,
     CandidateKind,
     CandidateSet,
-    Heartbeat,
-    InterfaceId,
-    InterfaceName,
-    LatencyReport,
-    Nack,
-    NodeName,
-    OutcomeReport,
-    PathReport,
-    Report,
-    ResourceKind,
-    Role,
-    ServiceName,
     ServiceOffer,
     ServiceSet,
     ServiceUse,
-    Version,
 )
+from protos.model.report import LatencyReport, OutcomeReport, PathReport, Report
+from protos.model.stream import Heartbeat, Nack, ResourceKind
 from protos.trust.candidate_signature import sign_candidates
 from sidecar.core.control.session import ControlSession, ControlState
 
 if TYPE_CHECKING:
     from lab.attacker.hostile_means import Means
-    from protos.model import SidecarMessage
+    from protos.model.stream import SidecarMessage
 
 REPORTS_A_TURN = 10
 INTERFACES = 32

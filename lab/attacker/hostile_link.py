@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 from lab.attacker.false_sessions import FalseSessions
 from lab.attacker.orders import Stage
 from lab.attacker.spoofing import Spoofer
-from protos.model import Role, ServiceName
+from protos.model.ids import Role, ServiceName
 from sidecar.core.base.values import PathState, Priority, RejectReason, RequestId
 from sidecar.core.crypto.key_schedule import proof_of_offer
 from sidecar.core.crypto.session import public_key

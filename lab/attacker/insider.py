@@ -26,7 +26,7 @@ from lab.attacker.hostile_link import ESCAPES, LARGE_ANSWER, HostileLink
 from lab.attacker.hostile_means import Means
 from lab.attacker.orders import ORDERS, TALLY, Commander, Stage
 from lab.attacker.tally import Tally
-from protos.model import ServiceName
+from protos.model.ids import ServiceName
 from protos.program.tls_files import load_tls_files
 from sidecar import __main__ as sidecar
 from sidecar import runtime

@@ -22,7 +22,7 @@ from lab.attacker.junk import mangled, noise
 from lab.attacker.orders import ORDERS, TALLY, Commander, Stage
 from lab.attacker.registration import registration
 from lab.attacker.tally import Tally
-from protos.model import Role
+from protos.model.ids import Role
 from protos.program.tls_files import load_tls_files
 from protos.stun.codec import MessageClass, StunMessage, encode
 

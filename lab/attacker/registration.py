@@ -7,7 +7,8 @@ import time
 from typing import TYPE_CHECKING
 
 from protos.convert import sidecar_message_to_proto
-from protos.model import PROTOCOL_VERSION, NodeName, Registration, Role, SessionId, Version
+from protos.model.ids import PROTOCOL_VERSION, NodeName, Role, SessionId, Version
+from protos.model.members import Registration
 from protos.trust.credential import Aead, SessionCredential, session_number
 
 if TYPE_CHECKING:

@@ -10,7 +10,7 @@ import dataclasses
 import sys
 from typing import Any
 
-from protos.model import ServiceName
+from protos.model.ids import ServiceName
 from sidecar import __main__ as sidecar
 from sidecar.core.robot.dispatch import dispatcher
 from sidecar.core.wire.messages import RequestMessage

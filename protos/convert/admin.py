@@ -6,7 +6,6 @@ import dataclasses
 from typing import TYPE_CHECKING
 
 from protos.base.errors import DecodeError
-from protos.base.names import clean_text, node_name, text
 from protos.convert.control import revocations_from_proto, revocations_to_proto
 from protos.convert.fields import (
     MAX_MAPPED_SERVICES,
@@ -30,14 +29,16 @@ from protos.convert.types import (
     use_from_proto,
     use_to_proto,
 )
-from protos.model import MAX_PATHS, MAX_UNMET, NO_REVOCATIONS, RevocationSet
+from protos.model.members import MAX_UNMET, NO_REVOCATIONS, RevocationSet
+from protos.model.names import clean_text, node_name, text
+from protos.model.report import MAX_PATHS
+from protos.model.status import ResourceStatus, SidecarStatus, StatusQuery, SyncState
 from protos.plr.v1 import admin_pb2
-from protos.status import ResourceStatus, SidecarStatus, StatusQuery, SyncState
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterable
 
-    from protos.model import ServiceName
+    from protos.model.ids import ServiceName
 
 _SYNC_STATES = {
     admin_pb2.SYNC_STATE_NOT_SENT: SyncState.NOT_SENT,

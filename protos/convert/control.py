@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING, assert_never
 from google.protobuf.message import DecodeError as ProtobufDecodeError
 
 from protos.base.errors import DecodeError, UnknownKindError
-from protos.base.names import clean_text, domain_label, node_name, text
 from protos.convert.fields import (
     MAX_CRL_BYTES,
     MAX_REMOVED,
@@ -42,29 +41,23 @@ from protos.convert.types import (
     use_from_proto,
     use_to_proto,
 )
-from protos.model import (
+from protos.model.mapping import MappingSet
+from protos.model.members import (
     MAX_PEERS,
     MAX_UNMET,
     TOKEN_BYTES,
-    Ack,
     CandidateSet,
-    ControlMessage,
-    Drain,
-    Heartbeat,
     HeldList,
-    MappingSet,
-    Nack,
     PeerSet,
     Registration,
     RemovalReason,
     RemovedPeer,
-    Report,
-    ResourceKind,
     RevocationSet,
     ServiceSet,
-    SidecarMessage,
-    Welcome,
 )
+from protos.model.names import clean_text, domain_label, node_name, text
+from protos.model.report import Report
+from protos.model.stream import Ack, ControlMessage, Drain, Heartbeat, Nack, ResourceKind, SidecarMessage, Welcome
 from protos.plr.v1 import control_pb2
 from protos.trust.identity import MAX_CA_CERTIFICATES
 

@@ -6,7 +6,6 @@ import math
 from typing import TYPE_CHECKING, Literal
 
 from protos.base.errors import DecodeError
-from protos.base.names import clean_text, interface_name, node_name, service_name, text
 from protos.convert.admin import resource_from_proto, resource_to_proto
 from protos.convert.events import why_from_proto, why_to_proto
 from protos.convert.fields import (
@@ -29,7 +28,7 @@ from protos.convert.mapping import (
     service_mapping_to_proto,
 )
 from protos.convert.types import histogram_from_proto, histogram_to_proto
-from protos.explanation import (
+from protos.model.explanation import (
     Alternative,
     AlternativeKind,
     Belief,
@@ -39,11 +38,12 @@ from protos.explanation import (
     MappingChange,
     PairExplanation,
 )
-from protos.model import MAX_JOINTS
+from protos.model.names import clean_text, interface_name, node_name, service_name, text
+from protos.model.report import MAX_JOINTS
 from protos.plr.v1 import admin_pb2
 
 if TYPE_CHECKING:
-    from protos.model import NodeName, ServiceName
+    from protos.model.ids import NodeName, ServiceName
 
 MAX_PAIRS = 4096
 """Pairs in one explanation."""

@@ -6,7 +6,7 @@ import math
 from typing import TYPE_CHECKING, TypeVar
 
 from protos.base.errors import DecodeError
-from protos.model import MAX_VERSION, Version
+from protos.model.ids import MAX_VERSION, Version
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence

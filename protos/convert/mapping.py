@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from protos.base.names import clean_text, interface_name, node_name, service_name, text
 from protos.convert.fields import MAX_ASSIGNMENTS, MAX_MAPPED_SERVICES, each, probability, unique, version
-from protos.model import Assignment, MappingSet, ServiceMapping
+from protos.model.mapping import Assignment, MappingSet, ServiceMapping
+from protos.model.names import clean_text, interface_name, node_name, service_name, text
 from protos.plr.v1 import control_pb2
 
 

@@ -8,7 +8,8 @@ from __future__ import annotations
 
 from protos.base.errors import DecodeError
 from protos.convert.fields import MAX_CANDIDATES, MAX_OFFERS, MAX_OUTCOMES, MAX_USES
-from protos.model import MAX_GOODBYES, MAX_JOINTS, MAX_LATENCIES, MAX_PATHS, MAX_PENALTIES, MAX_UNMET
+from protos.model.members import MAX_UNMET
+from protos.model.report import MAX_GOODBYES, MAX_JOINTS, MAX_LATENCIES, MAX_PATHS, MAX_PENALTIES
 from protos.plr.v1 import control_pb2
 from protos.trust.identity import MAX_CA_CERTIFICATES
 

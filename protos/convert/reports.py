@@ -6,7 +6,6 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from protos.base.errors import DecodeError
-from protos.base.names import interface_name, node_name, service_name
 from protos.base.size_class import SIZE_CLASSES
 from protos.convert.fields import (
     MAX_EVENTS,
@@ -20,7 +19,8 @@ from protos.convert.fields import (
 )
 from protos.convert.mapping import assignment_from_proto, assignment_to_proto
 from protos.convert.types import histogram_from_proto, histogram_to_proto
-from protos.model import (
+from protos.model.names import interface_name, node_name, service_name
+from protos.model.report import (
     MAX_GOODBYES,
     MAX_JOINTS,
     MAX_LATENCIES,
@@ -39,7 +39,7 @@ from protos.plr.v1 import control_pb2
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from protos.model import NodeName
+    from protos.model.ids import NodeName
 
 PART_ENTRIES = 32
 """Some 2 ms, with what is made of them."""

@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING
 
 from protos.base.errors import DecodeError
 from protos.base.histogram import BUCKETS, LAYOUT, Histogram
-from protos.base.names import domain_label, interface_name, node_name, service_name, type_name
 from protos.convert.fields import (
     MAX_CANDIDATES,
     MAX_CAPACITY,
@@ -23,28 +22,25 @@ from protos.convert.fields import (
     probability,
     unique,
 )
-from protos.model import (
+from protos.model.ids import Address, InterfaceId, InterfaceName, Role, ServiceName, SessionId
+from protos.model.members import (
     ALL_CALLS,
     MAX_CANDIDATES_OF_INTERFACE,
     MAX_CREDENTIAL_BYTES,
     MAX_SIGNATURE_BYTES,
     TOKEN_BYTES,
-    Address,
     CallPermit,
     Candidate,
     CandidateKind,
-    InterfaceId,
-    InterfaceName,
+    Copies,
+    InterfaceLabel,
     Peer,
-    Role,
-    ServiceName,
     ServiceOffer,
     ServiceUse,
-    SessionId,
 )
+from protos.model.names import domain_label, interface_name, node_name, service_name, type_name
+from protos.model.redundancy_mode import DEFAULT_HEDGE_QUANTILE, RedundancyMode
 from protos.plr.v1 import types_pb2
-from protos.preferences import Copies, InterfaceLabel
-from protos.redundancy_mode import DEFAULT_HEDGE_QUANTILE, RedundancyMode
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

@@ -28,7 +28,7 @@ class OneLineParser(argparse.ArgumentParser):
 
 
 def checked(check: Callable[[str, str], N], what: str = "the name") -> Callable[[str], N]:
-    """An argument's type: what passes one of the checks of protos/base/names.py; `what` it is begins the error."""
+    """An argument's type: what passes one of the checks of protos/model/names.py; `what` it is begins the error."""
 
     def parse(text: str) -> N:
         try:

@@ -19,7 +19,7 @@ def commit() -> str | None:
     try:
         return (folder / STAMP).read_text().strip() or None
     except (OSError, UnicodeDecodeError):
-        return _asked_of_git(folder.parent)
+        return _asked_of_git(folder.parents[1])
 
 
 def version() -> str:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from protos.trust.certificate_term import remedy
+from protos.program.certificate_term import remedy
 from protos.trust.identity import CONTROL_PLANE_DNS, CertificateError
 
 if TYPE_CHECKING:

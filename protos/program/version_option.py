@@ -6,7 +6,7 @@ import argparse
 import sys
 from typing import TYPE_CHECKING, Any
 
-from protos.model import PROTOCOL_VERSION
+from protos.model.ids import PROTOCOL_VERSION
 from protos.program import commit
 
 if TYPE_CHECKING:

@@ -48,7 +48,7 @@ from typing import TYPE_CHECKING
 from protos.base.errors import DecodeError
 
 if TYPE_CHECKING:
-    from protos.model import Address
+    from protos.model.ids import Address
 
 MAGIC_COOKIE = 0x2112A442
 HEADER_BYTES = 20

@@ -18,14 +18,15 @@ from typing import TYPE_CHECKING
 
 from cryptography.exceptions import InvalidSignature
 
-from protos.model import CandidateKind
+from protos.model.members import CandidateKind
 from protos.trust.credential import SIGNATURE_ALGORITHM, signer_key
 from protos.trust.identity import UNTRUSTED, CertificateError
 
 if TYPE_CHECKING:
     from cryptography.hazmat.primitives.asymmetric import ec
 
-    from protos.model import Candidate, SessionId
+    from protos.model.ids import SessionId
+    from protos.model.members import Candidate
 
 _LABEL = b"plr candidates\0"
 _HEAD = struct.Struct(">QQH")

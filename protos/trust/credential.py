@@ -26,8 +26,9 @@ from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.x509 import load_der_x509_certificate
 
 from protos.base.errors import DecodeError
-from protos.base.names import node_name
-from protos.model import MAX_CREDENTIAL_BYTES, NodeName, Role, SessionId
+from protos.model.ids import NodeName, Role, SessionId
+from protos.model.members import MAX_CREDENTIAL_BYTES
+from protos.model.names import node_name
 from protos.trust.identity import MALFORMED, UNTRUSTED, WRONG_ROLE, CertificateError, Identity, IdentityRole
 
 if TYPE_CHECKING:

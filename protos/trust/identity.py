@@ -27,10 +27,10 @@ from cryptography.x509.oid import ExtendedKeyUsageOID, SignatureAlgorithmOID
 
 from protos.base.durations import in_words
 from protos.base.errors import DecodeError
-from protos.base.names import node_name
+from protos.model.names import node_name
 
 if TYPE_CHECKING:
-    from protos.model import NodeName
+    from protos.model.ids import NodeName
 
 CONTROL_PLANE_DNS = "controlplane.plr.internal"
 """The name that every client demands of the control plane's certificate, at whatever address it was reached."""

@@ -9,9 +9,9 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field, PlainValidato
 
 from protos.base.errors import DecodeError
 from protos.base.host_port import check_remote
-from protos.base.names import domain_label, node_name
 from protos.convert.fields import MAX_COPIES
-from protos.preferences import AT_MOST_EVERY_INTERFACE, EVERY_INTERFACE, Copies
+from protos.model.members import AT_MOST_EVERY_INTERFACE, EVERY_INTERFACE, Copies
+from protos.model.names import domain_label, node_name
 from protos.program.config_fields import encoded_path, refuse_duplicates
 
 _INTERFACE = re.compile(r"[!-.0-~]{1,15}")

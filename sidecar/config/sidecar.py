@@ -12,8 +12,8 @@ from pydantic import AfterValidator, Field, model_validator
 
 from protos.base.errors import ConfigError
 from protos.base.host_port import is_loopback
-from protos.model import NodeName, Role, ServiceName
-from protos.preferences import DEFAULT_CHARGE, InterfaceLabel
+from protos.model.ids import NodeName, Role, ServiceName
+from protos.model.members import DEFAULT_CHARGE, InterfaceLabel
 from protos.program.config_fields import (
     AbsolutePath,
     IpAddress,
@@ -43,7 +43,7 @@ from sidecar.core.rules.service_rule import Rules, ServiceRule
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator
 
-    from protos.model import InterfaceName
+    from protos.model.ids import InterfaceName
     from protos.trust.identity import Identity
     from sidecar.core.rules.budget import Budget
 

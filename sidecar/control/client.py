@@ -19,9 +19,11 @@ from typing import TYPE_CHECKING, NamedTuple
 import grpc
 
 from protos.base.errors import DecodeError, UnknownKindError
-from protos.base.names import clean_text
 from protos.convert import control_message_from_proto, sidecar_message_to_proto
-from protos.model import PeerSet, Report, ResourceKind, ServiceSet, Welcome
+from protos.model.members import PeerSet, ServiceSet
+from protos.model.names import clean_text
+from protos.model.report import Report
+from protos.model.stream import ResourceKind, Welcome
 from protos.plr.v1 import control_pb2_grpc
 from protos.program import tls_advice
 from sidecar.control.channel import REFUSALS, open_channel
@@ -33,7 +35,7 @@ from sidecar.core.control.watch import CHEAPER
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from protos.model import CandidateSet, RevocationSet
+    from protos.model.members import CandidateSet, RevocationSet
     from protos.plr.v1 import control_pb2
     from protos.program.tls_files import TlsWatch
     from sidecar.control.hooks import ControlHooks

@@ -5,7 +5,10 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Protocol
 
 if TYPE_CHECKING:
-    from protos.model import MappingSet, PeerSet, Report, Welcome
+    from protos.model.mapping import MappingSet
+    from protos.model.members import PeerSet
+    from protos.model.report import Report
+    from protos.model.stream import Welcome
     from protos.program.tls_files import TlsFiles
     from sidecar.core.base.report_scope import ReportScope
 

@@ -13,13 +13,14 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Protocol
 
 from protos.convert.fields import MAX_CRL_BYTES
-from protos.revocation_views import revocation_set
 from protos.trust.identity import CertificateError
+from protos.trust.revocation_views import revocation_set
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
 
-    from protos.model import NodeName, RevocationSet
+    from protos.model.ids import NodeName
+    from protos.model.members import RevocationSet
     from protos.program.tls_files import TlsWatch
     from protos.trust.identity import RevocationList
 

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from protos.base.errors import ConfigError, DecodeError
-from protos.model import NodeName, ServiceName
+from protos.model.ids import NodeName, ServiceName
 from protos.program.config_file import parse_yaml, read_text
 from protos.program.regular_file import read_regular
 from protos.program.tls_files import load_tls_files

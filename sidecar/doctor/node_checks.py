@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from protos.trust.certificate_term import term_problem
+from protos.program.certificate_term import term_problem
 from protos.trust.clock_floor import SLACK_S
 from sidecar.doctor.finding import duration, fail, ok, warn
 

@@ -22,8 +22,8 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 from protos.base.errors import ConfigError, DecodeError
-from protos.base.names import interface_name, node_name
 from protos.base.printable import escaped
+from protos.model.names import interface_name, node_name
 from protos.program.arguments import checked, number, whole
 from sidecar.core.link.pinging import LEAST_BYTES
 from sidecar.core.wire.frame import MAX_DATAGRAM_BYTES
@@ -36,7 +36,7 @@ if TYPE_CHECKING:
     import argparse
     from collections.abc import Callable, Sequence
 
-    from protos.model import InterfaceName
+    from protos.model.ids import InterfaceName
     from sidecar.config.sidecar import SidecarConfig
     from sidecar.doctor.examination import Where
     from sidecar.local.client import LocalClient

@@ -17,7 +17,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from protos.base.errors import DecodeError
-from protos.base.names import node_name
+from protos.model.names import node_name
 from sidecar.core.wire.frame import MAX_DATAGRAM_BYTES
 
 VERSION = 1

@@ -14,14 +14,14 @@ from dataclasses import dataclass
 from itertools import islice
 from typing import TYPE_CHECKING, Any
 
-from protos.trust.certificate_term import term_problem
+from protos.program.certificate_term import term_problem
 from sidecar.core.base.values import PathState
 from sidecar.local.protocol import VERSION
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Mapping
 
-    from protos.model import InterfaceName
+    from protos.model.ids import InterfaceName
     from protos.program.tls_files import TlsWatch
     from protos.trust.clock_floor import ClockFloor
     from sidecar.config.sidecar import SidecarConfig

@@ -19,7 +19,7 @@ from sidecar.net.sockets import normalise, to_sockaddr
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from protos.model import Address
+    from protos.model.ids import Address
     from sidecar.core.seam.stats import LinkStats
 
     _SockAddr = tuple[str, int] | tuple[str, int, int, int]

@@ -29,7 +29,7 @@ from sidecar.net.host_names import HostNames
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable, Mapping, Sequence
 
-    from protos.model import Address, InterfaceName
+    from protos.model.ids import Address, InterfaceName
     from sidecar.core.base.values import PathState
     from sidecar.core.control.session import ControlStats
     from sidecar.core.control.ways import ControlInterface, Way

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 from sidecar.core.control.watch import KEEPALIVE_S, Seen
 
 if TYPE_CHECKING:
-    from protos.model import Address
+    from protos.model.ids import Address
     from sidecar.core.control.ways import Way
 
 USER_TIMEOUT_MS = 5_000

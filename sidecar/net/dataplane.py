@@ -28,19 +28,10 @@ from sidecar.net.watchdog import LOOK_EVERY_S, Watchdog
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Mapping
 
-    from protos.model import (
-        InterfaceName,
-        MappingSet,
-        NodeName,
-        Peer,
-        PeerSet,
-        Report,
-        ServiceMapping,
-        ServiceName,
-        ServiceOffer,
-        ServiceUse,
-        SessionId,
-    )
+    from protos.model.ids import InterfaceName, NodeName, ServiceName, SessionId
+    from protos.model.mapping import MappingSet, ServiceMapping
+    from protos.model.members import Peer, PeerSet, ServiceOffer, ServiceUse
+    from protos.model.report import Report
     from protos.trust.credential import SessionCredential
     from sidecar.core.base.report_scope import ReportScope
     from sidecar.core.base.values import ExecutionId, PathId, RejectReason, RequestId

@@ -19,7 +19,7 @@ from sidecar.net.sockets import normalise
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from protos.model import Address
+    from protos.model.ids import Address
 
 log = logging.getLogger(__name__)
 

@@ -11,7 +11,7 @@ import time
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from protos.model import Candidate, InterfaceId, InterfaceName
+from protos.model.ids import InterfaceId, InterfaceName
 from sidecar.core.interfaces.readiness import Readiness
 from sidecar.core.interfaces.scan_schedule import WITHOUT_NEWS_S, ScanSchedule
 from sidecar.core.link.datagrams import LinkIdentity
@@ -25,7 +25,8 @@ from sidecar.net.netlink_watch import NetlinkWatch
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from protos.model import Address
+    from protos.model.ids import Address
+    from protos.model.members import Candidate
     from sidecar.config.sidecar import SidecarConfig
     from sidecar.core.crypto.session import OwnSession
     from sidecar.core.link.memory import LinkMemory

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     import socket
     from collections.abc import Callable
 
-    from protos.model import Address, InterfaceName
+    from protos.model.ids import Address, InterfaceName
     from sidecar.core.link.link import Link
     from sidecar.core.link.pinging import Pong
     from sidecar.core.seam.links import LinkCommand, LinkEvent

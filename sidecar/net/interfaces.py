@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 from pyroute2 import IPRoute, NetlinkError
 
-from protos.model import InterfaceName
+from protos.model.ids import InterfaceName
 from sidecar.config.fields import is_glob
 from sidecar.core.seam.links import Rebind
 

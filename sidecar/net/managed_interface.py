@@ -11,7 +11,7 @@ import random
 import time
 from typing import TYPE_CHECKING
 
-from protos.model import Candidate, CandidateKind
+from protos.model.members import Candidate, CandidateKind
 from sidecar.core.control.ways import families_in_turn
 from sidecar.core.link.link import Link
 from sidecar.core.path.pmtu import LEAST_MTU
@@ -23,7 +23,7 @@ from sidecar.net.sockets import BoundTo, open_socket
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
-    from protos.model import Address, InterfaceName
+    from protos.model.ids import Address, InterfaceName
     from sidecar.core.link.datagrams import LinkIdentity
     from sidecar.core.link.memory import LinkMemory
     from sidecar.core.path.key_exchange import KeyLimits

@@ -15,9 +15,9 @@ from prometheus_client.core import HistogramMetricFamily, InfoMetricFamily
 from prometheus_client.registry import Collector
 
 from protos.base.host_port import split_host_port
-from protos.model import ResourceKind
+from protos.model.stream import ResourceKind
 from protos.program.metrics_server import MetricsServer
-from protos.revocation_views import revocation_gauges
+from protos.trust.revocation_views import revocation_gauges
 from sidecar.core.control.watch import LEAVE_CAUSES
 from sidecar.core.control.ways import DIAL_DROPS
 from sidecar.core.engine.revocation_exchange import EXCHANGES
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
     from prometheus_client import Metric
 
-    from protos.model import InterfaceName, ServiceName
+    from protos.model.ids import InterfaceName, ServiceName
     from protos.trust.identity import Identity
     from sidecar.control.revocations import RevocationState
     from sidecar.core.control.session import ControlStats

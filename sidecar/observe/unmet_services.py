@@ -7,7 +7,7 @@ from __future__ import annotations
 import difflib
 from typing import TYPE_CHECKING
 
-from protos.model import ServiceName
+from protos.model.ids import ServiceName
 from sidecar.config.fields import is_glob
 
 if TYPE_CHECKING:

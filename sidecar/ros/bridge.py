@@ -11,7 +11,7 @@ import threading
 import time
 from typing import TYPE_CHECKING, Protocol
 
-from protos.model import Role
+from protos.model.ids import Role
 from sidecar.core.base.values import RejectReason
 from sidecar.core.seam.application import ExecuteRequest
 from sidecar.ros.cloud.cloud_side import CloudSide

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 from sidecar.core.seam.application import AbandonExecution, CallsForbidden, CancelExecution, ExecuteRequest
 
 if TYPE_CHECKING:
-    from protos.model import NodeName
+    from protos.model.ids import NodeName
     from sidecar.core.seam.application import ApplicationEvent
 
 

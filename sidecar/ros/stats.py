@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from protos.model import ServiceName
+    from protos.model.ids import ServiceName
 
 
 @dataclass(slots=True)

@@ -30,10 +30,13 @@ from typing import TYPE_CHECKING
 from protos.base.errors import DecodeError
 from protos.base.host_port import canonical_ip
 from protos.convert import control_message_to_proto, parse_control_message
-from protos.model import TOKEN_BYTES, MappingSet, NodeName, PeerSet, Welcome
+from protos.model.mapping import MappingSet
+from protos.model.members import TOKEN_BYTES, PeerSet
+from protos.model.stream import Welcome
 
 if TYPE_CHECKING:
-    from protos.model import Address, ControlMessage
+    from protos.model.ids import Address, NodeName
+    from protos.model.stream import ControlMessage
 
 FORMAT_VERSION = 1
 """Of a file; another one is refused."""

@@ -16,7 +16,7 @@ from sidecar.core.wire.introduction import MAX_INTRODUCED_BYTES
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from protos.model import NodeName, Role
+    from protos.model.ids import NodeName, Role
     from protos.program.tls_files import TlsFiles
     from protos.trust.clock_floor import ClockFloor
     from protos.trust.identity import Identity

@@ -17,7 +17,7 @@ from collections import Counter
 from typing import TYPE_CHECKING, TypeVar
 
 from protos.base.errors import DecodeError
-from protos.model import TOKEN_BYTES
+from protos.model.members import TOKEN_BYTES
 from protos.program.own_folder import OwnFolder
 from protos.program.regular_file import open_regular
 from sidecar.state.file import (
@@ -41,7 +41,8 @@ if TYPE_CHECKING:
     from collections.abc import Callable
     from pathlib import Path
 
-    from protos.model import Address, ControlMessage, NodeName
+    from protos.model.ids import Address, NodeName
+    from protos.model.stream import ControlMessage
 
 log = logging.getLogger(__name__)
 

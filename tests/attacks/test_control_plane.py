@@ -19,7 +19,7 @@ from controlplane.ca import Authority, Validity
 from controlplane.ca.files import write_tls_files
 from lab.attacker.control_client import CONNECT, CONTROL_PLANE_DNS
 from lab.system import CONTROL_PORT
-from protos.model import Role
+from protos.model.ids import Role
 from protos.trust.identity import IdentityRole
 from tests.attacks.registrations import registration
 from tests.attacks.world import ATTACKER, World

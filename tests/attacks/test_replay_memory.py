@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from protos.model import InterfaceId, InterfaceName, NodeName, PeerSet, Role, SessionId, Version
+from protos.model.ids import InterfaceId, InterfaceName, NodeName, Role, SessionId, Version
+from protos.model.members import PeerSet
 from sidecar.core.link.memory import MAX_PATHS_OF_A_PEER
 from sidecar.core.path.key_exchange import DEFAULT_LIMITS, KeyLimits
 from sidecar.core.path.keys import make_path_keys
@@ -21,7 +22,7 @@ from tests.sessions import credential_of, seal, session_of
 from tests.sim.mesh import Mesh, rule
 
 if TYPE_CHECKING:
-    from protos.model import Address
+    from protos.model.ids import Address
     from sidecar.core.link.link import Link
     from tests.sim.mesh import Node
 

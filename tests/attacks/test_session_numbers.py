@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from protos.model import PeerSet, Role, Version
+from protos.model.ids import Role, Version
+from protos.model.members import PeerSet
 from protos.trust.credential import session_number
 from protos.trust.identity import MALFORMED, CertificateError
 from tests.sessions import session_of

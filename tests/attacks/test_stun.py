@@ -19,7 +19,7 @@ from tests.attacks.world import ATTACKER, ATTACKERS_PORT, World, is_ours, send_a
 
 if TYPE_CHECKING:
     from lab.attacker.wire import Tap
-    from protos.model import Address
+    from protos.model.ids import Address
 
 pytestmark = [pytest.mark.netns, pytest.mark.ros, pytest.mark.timeout(180)]
 

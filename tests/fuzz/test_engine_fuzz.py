@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from protos.model import Role, ServiceName
+from protos.model.ids import Role, ServiceName
 from sidecar.core.base.values import PathState, Priority, RejectReason, RequestId
 from sidecar.core.cloud.answers import MAX_ANSWER_BYTES, MAX_ANSWERS
 from sidecar.core.cloud.answers import TIMER_SLACK as ANSWER_TIMER_SLACK
@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     import random
     from collections.abc import Callable, Iterable, Iterator
 
-    from protos.model import InterfaceName
+    from protos.model.ids import InterfaceName
     from sidecar.core.path.path import Path
 
 

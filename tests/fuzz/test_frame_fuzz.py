@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from protos.base.errors import DecodeError
-from protos.model import InterfaceId, SessionId
+from protos.model.ids import InterfaceId, SessionId
 from sidecar.core.wire import frame
 from sidecar.core.wire.frame import AckFrame, Finished, Fragment, Header, Probe, ProbeReply
 

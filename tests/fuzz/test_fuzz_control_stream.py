@@ -18,7 +18,10 @@ import pytest
 from lab.attacker.control_client import CONNECT
 from lab.attacker.junk import mangled, noise
 from protos.convert import sidecar_message_to_proto
-from protos.model import CandidateSet, Drain, Heartbeat, NodeName, Report, Role, ServiceSet
+from protos.model.ids import NodeName, Role
+from protos.model.members import CandidateSet, ServiceSet
+from protos.model.report import Report
+from protos.model.stream import Drain, Heartbeat
 from protos.trust.identity import CONTROL_PLANE_DNS, IdentityRole
 from tests.attacks.registrations import registration
 from tests.integration.control_plane_process import Secured, cloud, open_channel, robot

@@ -28,7 +28,7 @@ from protos.convert import (
     status_from_proto,
     status_to_proto,
 )
-from protos.model import NodeName
+from protos.model.ids import NodeName
 from protos.plr.v1 import admin_pb2
 from sidecar.state import file
 from sidecar.state.file import LastGood

@@ -11,7 +11,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from protos.base.errors import DecodeError
-from protos.model import MappingSet, NodeName, PeerSet, Version, Welcome
+from protos.model.ids import NodeName, Version
+from protos.model.mapping import MappingSet
+from protos.model.members import PeerSet
+from protos.model.stream import Welcome
 from sidecar.state.file import (
     FORMAT_VERSION,
     LAST_GOOD_VERSION,

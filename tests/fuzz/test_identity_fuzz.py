@@ -9,7 +9,7 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from controlplane.ca import Authority
-from protos.model import NodeName, Role, SessionId
+from protos.model.ids import NodeName, Role, SessionId
 from protos.trust.credential import Aead, SessionCredential, verify
 from protos.trust.identity import CertificateError, IdentityRole, Trust
 from tests.unit.protos.forged import NOW, Recipe, uri

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from protos.model import InterfaceId, SessionId
+from protos.model.ids import InterfaceId, SessionId
 from sidecar.core.base.values import PathId
 from sidecar.core.crypto.aead import TAG_BYTES
 from sidecar.core.link.path_table import MAX_PATHS_OF_A_PEER, MAX_PENDING_FRAMES

@@ -7,8 +7,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from protos.base.errors import DecodeError
-from protos.base.names import clean_text
-from protos.model import ServiceName
+from protos.model.ids import ServiceName
+from protos.model.names import clean_text
 from sidecar.core.base.values import Priority, RejectReason, RequestId
 from sidecar.core.wire.messages import (
     MAX_NAME_BYTES,

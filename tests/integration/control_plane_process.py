@@ -16,22 +16,10 @@ import grpc
 import yaml
 
 from protos.convert import control_message_from_proto, sidecar_message_to_proto, status_from_proto
-from protos.model import (
-    Ack,
-    CandidateSet,
-    ControlMessage,
-    Drain,
-    Heartbeat,
-    MappingSet,
-    Nack,
-    PeerSet,
-    Registration,
-    ResourceKind,
-    Role,
-    ServiceSet,
-    SidecarMessage,
-    Version,
-)
+from protos.model.ids import Role, Version
+from protos.model.mapping import MappingSet
+from protos.model.members import CandidateSet, PeerSet, Registration, ServiceSet
+from protos.model.stream import Ack, ControlMessage, Drain, Heartbeat, Nack, ResourceKind, SidecarMessage
 from protos.plr.v1 import admin_pb2, admin_pb2_grpc, control_pb2, control_pb2_grpc
 from protos.trust.credential import Aead, SessionCredential, session_number
 from protos.trust.identity import CONTROL_PLANE_DNS
@@ -44,7 +32,7 @@ if TYPE_CHECKING:
     from cryptography.hazmat.primitives.asymmetric.ec import EllipticCurvePrivateKey
 
     from controlplane.ca import Issued
-    from protos.status import SidecarStatus, SyncState
+    from protos.model.status import SidecarStatus, SyncState
 
 Message = TypeVar("Message", bound=ControlMessage)
 

@@ -19,22 +19,9 @@ from typing import TYPE_CHECKING, Any, Self
 
 from bench.dataplane.programs.engine import TYPE, described, peer_of
 from bench.dataplane.remote import Remote
-from protos.model import (
-    Assignment,
-    Candidate,
-    CandidateKind,
-    InterfaceId,
-    InterfaceName,
-    MappingSet,
-    NodeName,
-    PeerSet,
-    Role,
-    ServiceMapping,
-    ServiceName,
-    ServiceOffer,
-    SessionId,
-    Version,
-)
+from protos.model.ids import InterfaceId, InterfaceName, NodeName, Role, ServiceName, SessionId, Version
+from protos.model.mapping import Assignment, MappingSet, ServiceMapping
+from protos.model.members import Candidate, CandidateKind, PeerSet, ServiceOffer
 from sidecar.core.base.values import RequestId
 from sidecar.core.engine.engine import EngineConfig
 from sidecar.core.link.datagrams import LinkIdentity

@@ -18,15 +18,17 @@ from controlplane.observe.metrics import Metrics
 from controlplane.serve import admin
 from controlplane.serve.admin import AdminService
 from protos.convert import status_from_proto
-from protos.fleet_events import EventKind
-from protos.model import CandidateSet, InterfaceName, NodeName, PathReport, Report, Role, ServiceSet
+from protos.model.fleet_events import EventKind
+from protos.model.ids import InterfaceName, NodeName, Role
+from protos.model.members import CandidateSet, ServiceSet
+from protos.model.report import PathReport, Report
 from protos.plr.v1 import admin_pb2, admin_pb2_grpc
 from tests.unit.controlplane.samples import histogram, interfaces, offer, registration, use
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable
 
-    from protos.model import SidecarMessage
+    from protos.model.stream import SidecarMessage
 
     Ask = Callable[[admin_pb2_grpc.AdminAsyncStub, ControlLoop], Awaitable[None]]
 

@@ -8,16 +8,10 @@ import signal
 import time
 from typing import TYPE_CHECKING
 
-from protos.model import (
-    CandidateSet,
-    MappingSet,
-    PeerSet,
-    Report,
-    Role,
-    ServiceSet,
-    Welcome,
-)
-from protos.status import SyncState
+from protos.model.ids import Role
+from protos.model.members import CandidateSet, PeerSet, ServiceSet
+from protos.model.report import Report
+from protos.model.status import SyncState
 from sidecar.control.client import ControlClient
 from sidecar.core.control.session import ControlSession
 from sidecar.net.control_dialer import ControlDialer
@@ -27,6 +21,8 @@ from tests.unit.controlplane.samples import interfaces, path, registration, use
 if TYPE_CHECKING:
     from pathlib import Path
 
+    from protos.model.mapping import MappingSet
+    from protos.model.stream import Welcome
     from protos.program.tls_files import TlsFiles
     from sidecar.core.base.report_scope import ReportScope
 

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from collections.abc import AsyncIterator
     from pathlib import Path
 
-    from protos.model import NodeName
+    from protos.model.ids import NodeName
     from tests.integration.test_tls_gate import Gate
 
 pytestmark = pytest.mark.audit("ops-19")

@@ -19,32 +19,20 @@ from typing import TYPE_CHECKING
 import grpc
 import pytest
 
-from protos.model import (
+from protos.model.ids import (
     PROTOCOL_VERSION,
-    Ack,
-    Candidate,
-    CandidateKind,
-    CandidateSet,
-    Drain,
-    Heartbeat,
     InterfaceId,
     InterfaceName,
-    MappingSet,
-    Nack,
     NodeName,
-    OutcomeReport,
-    PeerSet,
-    Registration,
-    Report,
-    ResourceKind,
     Role,
     ServiceName,
-    ServiceOffer,
-    ServiceSet,
     SessionId,
     Version,
-    Welcome,
 )
+from protos.model.mapping import MappingSet
+from protos.model.members import Candidate, CandidateKind, CandidateSet, PeerSet, Registration, ServiceOffer, ServiceSet
+from protos.model.report import OutcomeReport, Report
+from protos.model.stream import Ack, Drain, Heartbeat, Nack, ResourceKind, Welcome
 from protos.plr.v1 import control_pb2
 from sidecar.control import client
 from sidecar.control.client import ControlClient
@@ -287,7 +275,7 @@ def test_comes_back_after_an_outage_at_the_same_address() -> None:
 
 SERVER_TO_KILL = """
 import sys, time
-from protos.model import Welcome
+from protos.model.stream import Welcome
 from tests.integration.scripted_control_plane import ScriptedControlPlane
 with ScriptedControlPlane(int(sys.argv[1]), welcome=Welcome(lease_s=3.0, report_interval_s=0.5)) as server:
     sys.stdin.read()

@@ -17,29 +17,20 @@ from typing import TYPE_CHECKING
 import yaml
 
 from protos.base.histogram import Histogram
-from protos.model import (
-    PROTOCOL_VERSION,
-    Assignment,
+from protos.model.ids import PROTOCOL_VERSION, InterfaceId, InterfaceName, NodeName, Role, ServiceName, SessionId
+from protos.model.mapping import Assignment, MappingSet
+from protos.model.members import (
     Candidate,
     CandidateKind,
     CandidateSet,
-    InterfaceId,
-    InterfaceName,
-    MappingSet,
-    NodeName,
-    PathReport,
     PeerSet,
     Registration,
-    Report,
-    ResourceKind,
-    Role,
-    ServiceName,
     ServiceOffer,
     ServiceSet,
     ServiceUse,
-    SessionId,
-    Welcome,
 )
+from protos.model.report import PathReport, Report
+from protos.model.stream import ResourceKind, Welcome
 from protos.trust.pair_token import pair_token
 from sidecar.control.client import ControlClient
 from sidecar.core.control import session

@@ -9,19 +9,12 @@ import grpc
 import pytest
 
 from controlplane.core.publish.snapshots import MAX_LIFTED
-from protos.model import (
-    Ack,
-    Drain,
-    MappingSet,
-    OutcomeReport,
-    PeerSet,
-    RemovalReason,
-    Report,
-    ResourceKind,
-    Role,
-    Welcome,
-)
-from protos.status import SyncState
+from protos.model.ids import Role
+from protos.model.mapping import MappingSet
+from protos.model.members import PeerSet, RemovalReason
+from protos.model.report import OutcomeReport, Report
+from protos.model.status import SyncState
+from protos.model.stream import Ack, Drain, ResourceKind, Welcome
 from tests.integration.control_plane_process import ControlPlaneProcess, Stream, cloud, robot
 from tests.unit.controlplane.samples import PLAN, histogram, latency, path, registration
 

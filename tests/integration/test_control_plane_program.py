@@ -16,9 +16,7 @@ import grpc
 import pytest
 import yaml
 
-from protos.model import (
-    Welcome,
-)
+from protos.model.stream import Welcome
 from tests.integration.control_plane_process import PATIENCE_S, ControlPlaneProcess, cloud
 
 if TYPE_CHECKING:
@@ -185,7 +183,7 @@ def test_an_address_in_use_ends_with_1_and_names_the_key(tmp_path: Path, key: st
 
 def test_the_schema_is_printed() -> None:
     done = subprocess.run(
-        [sys.executable, "-m", "controlplane.cli.__main__", "config", "schema", "controlplane"],
+        [sys.executable, "-m", "controlplane.cli", "config", "schema", "controlplane"],
         capture_output=True,
         text=True,
         check=True,

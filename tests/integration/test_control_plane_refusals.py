@@ -9,11 +9,8 @@ import grpc
 import pytest
 
 from protos.convert import sidecar_message_to_proto
-from protos.model import (
-    PROTOCOL_VERSION,
-    Role,
-    Welcome,
-)
+from protos.model.ids import PROTOCOL_VERSION, Role
+from protos.model.stream import Welcome
 from protos.plr.v1 import control_pb2
 from tests.integration.control_plane_process import PATIENCE_S, ControlPlaneProcess, Sidecar, Stream, cloud
 from tests.unit.controlplane.samples import registration

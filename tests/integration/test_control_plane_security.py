@@ -18,7 +18,11 @@ from grpc_reflection.v1alpha import reflection_pb2, reflection_pb2_grpc
 
 from controlplane.ca import Authority, Validity
 from controlplane.serve.tls_gate import MAX_SILENT_PER_SOURCE
-from protos.model import MappingSet, RemovalReason, Report, Role, Welcome
+from protos.model.ids import Role
+from protos.model.mapping import MappingSet
+from protos.model.members import RemovalReason
+from protos.model.report import Report
+from protos.model.stream import Welcome
 from protos.plr.v1 import admin_pb2, admin_pb2_grpc, control_pb2
 from protos.trust.identity import CONTROL_PLANE_DNS, IdentityRole
 from tests.integration.control_plane_process import (

@@ -16,14 +16,11 @@ import pytest
 from grpc_health.v1 import health_pb2, health_pb2_grpc
 from grpc_reflection.v1alpha import reflection_pb2, reflection_pb2_grpc
 
-from protos.model import (
-    Heartbeat,
-    MappingSet,
-    OutcomeReport,
-    PeerSet,
-    Report,
-)
-from protos.status import SyncState
+from protos.model.mapping import MappingSet
+from protos.model.members import PeerSet
+from protos.model.report import OutcomeReport, Report
+from protos.model.status import SyncState
+from protos.model.stream import Heartbeat
 from protos.stun.codec import MessageClass, StunMessage, decode, encode
 from tests.integration.control_plane_process import PATIENCE_S, ControlPlaneProcess, cloud, robot
 from tests.unit.controlplane.samples import PLAN, histogram, path
@@ -93,7 +90,7 @@ def test_status_as_a_table_and_as_json(plane: ControlPlaneProcess) -> None:
         r.nack(r.expect(PeerSet, lambda message: bool(message.peers)), "not\nthis\tone")
         plane.wait_for_state("robot", SyncState.REJECTED)
         table = subprocess.run(
-            [sys.executable, "-m", "controlplane.cli.__main__", "status", "--insecure", "--address", plane.address],
+            [sys.executable, "-m", "controlplane.cli", "status", "--insecure", "--address", plane.address],
             capture_output=True,
             text=True,
             check=True,
@@ -102,7 +99,7 @@ def test_status_as_a_table_and_as_json(plane: ControlPlaneProcess) -> None:
             [
                 sys.executable,
                 "-m",
-                "controlplane.cli.__main__",
+                "controlplane.cli",
                 "status",
                 "--insecure",
                 "--address",

@@ -22,7 +22,7 @@ from controlplane.core.control.control import ControlCore
 from controlplane.observe.fleet_metrics import Fleet
 from controlplane.observe.metrics import Metrics
 from protos.base.host_port import split_host_port
-from protos.model import NodeName, Role
+from protos.model.ids import NodeName, Role
 from protos.trust.identity import Identity, IdentityRole, RevocationList
 from sidecar.config.sidecar import SidecarConfig, load_config
 from sidecar.control.revocations import RevocationState

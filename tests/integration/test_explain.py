@@ -8,7 +8,7 @@ import grpc
 import pytest
 
 from controlplane.cli.__main__ import main
-from protos.model import Report
+from protos.model.report import Report
 from protos.plr.v1 import admin_pb2, admin_pb2_grpc
 from tests.integration.control_plane_process import PATIENCE_S, ControlPlaneProcess, cloud, robot
 from tests.unit.controlplane.samples import histogram, latency, path

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from protos.model import PeerSet
+from protos.model.members import PeerSet
 from protos.trust.identity import IdentityRole
 from tests.integration.control_plane_process import PATIENCE_S, cloud, robot
 from tests.integration.secured_control_plane import SecuredControlPlane

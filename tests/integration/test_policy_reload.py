@@ -6,7 +6,8 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from protos.model import NO_POLICY, NodeName, RemovalReason, RemovedPeer, ServiceName
+from protos.model.ids import NodeName, ServiceName
+from protos.model.members import NO_POLICY, RemovalReason, RemovedPeer
 from tests.integration.control_plane_process import ControlPlaneProcess, cloud, robot
 
 if TYPE_CHECKING:

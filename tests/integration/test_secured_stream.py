@@ -13,12 +13,15 @@ import pytest
 
 from controlplane.ca import Authority, Validity
 from controlplane.ca.files import write_atomically
-from protos.model import MappingSet, PeerSet, Report, ResourceKind, Role, ServiceSet, Welcome
+from protos.model.ids import Role
+from protos.model.members import PeerSet, ServiceSet
+from protos.model.report import Report
+from protos.model.stream import ResourceKind, Welcome
 from protos.program.tls_files import TlsWatch, load_tls_files
-from protos.revocation_views import revocation_set
 from protos.trust.candidate_signature import verify_candidates
 from protos.trust.credential import decode_credential
 from protos.trust.identity import CertificateError, IdentityRole
+from protos.trust.revocation_views import revocation_set
 from sidecar.control import client
 from sidecar.control.announcement import Announcer
 from sidecar.control.client import ControlClient
@@ -40,6 +43,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
     from pathlib import Path
 
+    from protos.model.mapping import MappingSet
     from protos.program.tls_files import TlsFiles
     from sidecar.core.base.report_scope import ReportScope
 
@@ -250,7 +254,7 @@ def test_a_name_that_is_not_the_certificates_is_refused_in_words(plane: SecuredC
 
 
 def plr(*arguments: str) -> subprocess.CompletedProcess[str]:
-    argv = [sys.executable, "-m", "controlplane.cli.__main__", *arguments]
+    argv = [sys.executable, "-m", "controlplane.cli", *arguments]
     return subprocess.run(argv, capture_output=True, text=True, check=False)
 
 

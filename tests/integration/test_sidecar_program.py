@@ -17,23 +17,10 @@ from typing import TYPE_CHECKING, Any
 import pytest
 import yaml
 
-from protos.model import (
-    Assignment,
-    CandidateSet,
-    InterfaceName,
-    MappingSet,
-    NodeName,
-    Peer,
-    PeerSet,
-    Registration,
-    Role,
-    ServiceMapping,
-    ServiceName,
-    SessionId,
-    Version,
-    Welcome,
-)
-from protos.preferences import InterfaceLabel
+from protos.model.ids import InterfaceName, NodeName, Role, ServiceName, SessionId, Version
+from protos.model.mapping import Assignment, MappingSet, ServiceMapping
+from protos.model.members import CandidateSet, InterfaceLabel, Peer, PeerSet, Registration
+from protos.model.stream import Welcome
 from sidecar.state.store import StateStore
 from tests.free_ports import free_port
 from tests.integration.scripted_control_plane import WAIT_S, ScriptedControlPlane

@@ -17,7 +17,7 @@ import pytest
 from controlplane.ca import Authority
 from controlplane.serve import tls_gate
 from controlplane.serve.tls_gate import TlsGate
-from protos.model import NodeName
+from protos.model.ids import NodeName
 from protos.program.tls_files import load_tls_files
 from protos.trust.clock_floor import ClockFloor
 from protos.trust.identity import CONTROL_PLANE_DNS, IdentityRole

@@ -24,7 +24,7 @@ import sys
 import time
 from typing import TYPE_CHECKING, Any
 
-from protos.model import InterfaceName
+from protos.model.ids import InterfaceName
 from sidecar.core.link.datagrams import Batch
 from sidecar.core.seam.stats import LinkStats
 from sidecar.net.batch_socket import BatchSocket
@@ -34,7 +34,7 @@ from sidecar.net.sockets import DataSocket, normalise, open_socket, to_sockaddr
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from protos.model import Address
+    from protos.model.ids import Address
 
 LINKS = {"wlan0": 1, "wwan0": 2}
 ECHO: dict[int, Address] = {4: ("10.9.9.9", 5000), 6: ("fd00:9::9", 5000)}

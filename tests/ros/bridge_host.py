@@ -7,7 +7,7 @@ import signal
 import sys
 import threading
 
-from protos.model import Role
+from protos.model.ids import Role
 from sidecar.core.rules.service_rule import ServiceRule
 from sidecar.ros.bridge import RosBridge
 from tests.ros.loopback import Loopback

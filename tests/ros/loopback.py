@@ -11,7 +11,8 @@ from collections import Counter
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
-from protos.model import Assignment, InterfaceName, NodeName, ServiceName, SessionId
+from protos.model.ids import InterfaceName, NodeName, ServiceName, SessionId
+from protos.model.mapping import Assignment
 from sidecar.core.base.values import ExecutionId, Priority
 from sidecar.core.seam.application import (
     AbandonExecution,
@@ -26,7 +27,7 @@ from sidecar.core.seam.application import (
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
 
-    from protos.model import ServiceOffer
+    from protos.model.members import ServiceOffer
     from sidecar.core.base.values import RejectReason, RequestId
     from sidecar.ports import Application
 

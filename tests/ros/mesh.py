@@ -11,7 +11,7 @@ import threading
 import time
 from typing import TYPE_CHECKING, Any
 
-from protos.model import Role
+from protos.model.ids import Role
 from sidecar.core.rules.service_rule import ServiceRule
 from sidecar.ros.bridge import RosBridge
 from tests.ros.loopback import Faults, Loopback

@@ -7,7 +7,7 @@ import signal
 import sys
 import threading
 
-from protos.model import Role, ServiceName
+from protos.model.ids import Role, ServiceName
 from sidecar.core.rules.service_rule import ServiceRule
 from sidecar.core.seam.application import OfferService
 from sidecar.ros.bridge import RosBridge

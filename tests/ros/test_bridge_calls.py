@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from protos.model import ServiceName
+from protos.model.ids import ServiceName
 from sidecar.ros import rcl
 
 if TYPE_CHECKING:
@@ -98,7 +98,7 @@ def test_answers_to_a_client_that_is_only_half_discovered_wait(mesh: Mesh, monke
             raise rcl.NewClientError("client will not receive response")
         send(*arguments)
 
-    monkeypatch.setattr("sidecar.ros.service_proxy.send_response", busy)
+    monkeypatch.setattr("sidecar.ros.robot.service_proxy.send_response", busy)
     mesh.start()
     mesh.serve("--plan", "/plan", "--deep")
     mesh.wait_carried("/plan")

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from protos.model import ServiceName
+from protos.model.ids import ServiceName
 from sidecar.core.base.values import RejectReason
 from sidecar.core.seam.application import AbandonExecution, CancelExecution
 from sidecar.ros.graph import graph

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from protos.model import Role, ServiceName
+from protos.model.ids import Role, ServiceName
 from sidecar.core.rules.service_rule import ServiceRule
 from sidecar.core.seam.application import OfferService
 from sidecar.ros.bridge import RosBridge

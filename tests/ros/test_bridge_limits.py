@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from protos.model import NodeName, ServiceName, SessionId
+from protos.model.ids import NodeName, ServiceName, SessionId
 from sidecar.core.base.values import RejectReason
 from sidecar.core.rules.service_rule import ServiceRule
 from sidecar.core.seam.application import OfferService

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from protos.model import Role
+from protos.model.ids import Role
 from sidecar.core.base.values import RejectReason
 from sidecar.ros.bridge import RosBridge
 from tests.ros.mesh import wait_until

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from protos.model import ServiceName
+from protos.model.ids import ServiceName
 from sidecar.core.rules.fallback_rule import FallbackRule
 from sidecar.core.rules.service_rule import ServiceRule
 from tests.ros.mesh import wait_until

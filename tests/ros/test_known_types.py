@@ -6,7 +6,8 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from protos.model import NodeName, Peer, PeerSet, Role, ServiceName, ServiceOffer, SessionId, Version
+from protos.model.ids import NodeName, Role, ServiceName, SessionId, Version
+from protos.model.members import Peer, PeerSet, ServiceOffer
 from sidecar.__main__ import main
 from sidecar.core.rules.service_rule import ServiceRule
 from sidecar.ros.graph.known_types import MAX_LINES, missing_types

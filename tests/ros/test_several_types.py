@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from protos.model import ServiceName
+from protos.model.ids import ServiceName
 from sidecar.core.base.values import RejectReason
 from sidecar.ros.graph import graph
 from tests.ros.mesh import no_name, wait_until

@@ -18,27 +18,25 @@ from typing import TYPE_CHECKING
 
 from controlplane.core.control.events import Settings
 from controlplane.core.publish.messages import CloseReason
-from protos.model import (
+from protos.model.ids import InterfaceName, NodeName, Role, ServiceName, SessionId, Version
+from protos.model.mapping import MappingSet
+from protos.model.members import (
+    AT_MOST_EVERY_INTERFACE,
+    EVERY_INTERFACE,
     CandidateSet,
-    InterfaceName,
-    MappingSet,
-    NodeName,
+    Copies,
+    InterfaceLabel,
     PeerSet,
-    Role,
-    ServiceName,
     ServiceSet,
     ServiceUse,
-    SessionId,
-    Version,
 )
-from protos.preferences import AT_MOST_EVERY_INTERFACE, EVERY_INTERFACE, Copies, InterfaceLabel
-from protos.status import SyncState
+from protos.model.status import SyncState
 from tests.sim.control_world import SimSidecar, World
 from tests.unit.controlplane.samples import PLAN_TYPE, interfaces, offer, path, registration, use
 
 if TYPE_CHECKING:
     from controlplane.core.policy.policy import Policy
-    from protos.model import Peer
+    from protos.model.members import Peer
 
 SERVICES = ("/plan", "/detect", "/grasp")
 NICS = ("wlan0", "wwan0", "eth0")

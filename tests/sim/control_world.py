@@ -10,29 +10,11 @@ from controlplane.core.control.events import DepartureNotice, NackNotice, Settin
 from controlplane.core.publish.messages import Close, CloseReason, Send
 from controlplane.core.registry.registry import Refusal, StreamId
 from controlplane.solver.matcher import solve
-from protos.model import (
-    Ack,
-    CandidateSet,
-    ControlMessage,
-    Drain,
-    Heartbeat,
-    MappingSet,
-    Nack,
-    NodeName,
-    PathReport,
-    Peer,
-    PeerSet,
-    Registration,
-    RemovalReason,
-    Report,
-    ResourceKind,
-    Role,
-    ServiceMapping,
-    ServiceSet,
-    SidecarMessage,
-    Version,
-    Welcome,
-)
+from protos.model.ids import NodeName, Role, Version
+from protos.model.mapping import MappingSet, ServiceMapping
+from protos.model.members import CandidateSet, Peer, PeerSet, Registration, RemovalReason, ServiceSet
+from protos.model.report import PathReport, Report
+from protos.model.stream import Ack, ControlMessage, Drain, Heartbeat, Nack, ResourceKind, SidecarMessage, Welcome
 from tests.unit.controlplane.samples import interfaces, offer, path, registration, use
 
 if TYPE_CHECKING:

@@ -20,14 +20,14 @@ from typing import TYPE_CHECKING
 from bench.evaluation.scenario import Scenario, read_scenarios
 from controlplane.planning.fifo import FifoLink
 from lab.trace_folder import read_folder
-from protos.redundancy_mode import RedundancyMode
+from protos.model.redundancy_mode import RedundancyMode
 from tests.sim.mesh import IPV6, Mesh, Node, rule
 from tests.sim.test_mesh import mapped
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from protos.model import Address
+    from protos.model.ids import Address
     from sidecar.core.rules.budget import Budget
 
 STARTING_S = 1.0

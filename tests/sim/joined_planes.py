@@ -11,24 +11,16 @@ from controlplane.core.publish.messages import Send
 from controlplane.core.registry.registry import Refusal
 from controlplane.solver.matcher import solve
 from protos.convert import control_message_to_proto, parse_control_message
-from protos.model import (
-    PROTOCOL_VERSION,
-    Ack,
-    CandidateSet,
-    Heartbeat,
-    MappingSet,
-    PeerSet,
-    Registration,
-    ResourceKind,
-    Role,
-    ServiceSet,
-    Welcome,
-)
+from protos.model.ids import PROTOCOL_VERSION, Role
+from protos.model.mapping import MappingSet
+from protos.model.members import CandidateSet, PeerSet, Registration, ServiceSet
+from protos.model.stream import Ack, Heartbeat, ResourceKind, Welcome
 
 if TYPE_CHECKING:
     from controlplane.core.policy.policy import Policy
     from controlplane.core.registry.registry import StreamId
-    from protos.model import ControlMessage, NodeName
+    from protos.model.ids import NodeName
+    from protos.model.stream import ControlMessage
     from tests.sim.mesh import Mesh, Node
 
 STEP_S = 0.02

@@ -8,22 +8,8 @@ from dataclasses import dataclass, field, replace
 from itertools import count
 from typing import TYPE_CHECKING
 
-from protos.model import (
-    ALL_CALLS,
-    Candidate,
-    CandidateKind,
-    InterfaceId,
-    InterfaceName,
-    MappingSet,
-    NodeName,
-    Peer,
-    PeerSet,
-    Role,
-    ServiceName,
-    ServiceOffer,
-    SessionId,
-    Version,
-)
+from protos.model.ids import InterfaceId, InterfaceName, NodeName, Role, ServiceName, SessionId, Version
+from protos.model.members import ALL_CALLS, Candidate, CandidateKind, Peer, PeerSet, ServiceOffer
 from protos.trust.credential import Aead
 from protos.trust.pair_token import pair_token
 from sidecar.control.announcement import Announcer
@@ -42,7 +28,8 @@ from tests.sessions import session_of
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from protos.model import Address
+    from protos.model.ids import Address
+    from protos.model.mapping import MappingSet
     from sidecar.core.crypto.session import OwnSession
     from sidecar.core.rules.budget import Budget
 

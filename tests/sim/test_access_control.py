@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING
 
 from controlplane.core.control.events import Settings
 from controlplane.core.policy.policy import CallRule, OfferRule, Policy
-from protos.model import NodeName, Role, ServiceName, ServiceOffer
+from protos.model.ids import NodeName, Role, ServiceName
+from protos.model.members import ServiceOffer
 from sidecar.core.robot.request.service_catalog import WITHDRAW_AFTER_S
 from sidecar.core.seam.application import CallsForbidden, ExecuteRequest, RequestFailed, WithdrawService
 from tests.sim.joined_planes import JoinedPlanes, restored

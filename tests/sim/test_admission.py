@@ -14,7 +14,9 @@ import pytest
 from controlplane.core.overload.admission import Admission
 from controlplane.core.overload.pacing import Pacing
 from controlplane.serve import tls_gate
-from protos.model import PROTOCOL_VERSION, NodeName, Registration, Role, SessionId, Welcome
+from protos.model.ids import PROTOCOL_VERSION, NodeName, Role, SessionId
+from protos.model.members import Registration
+from protos.model.stream import Welcome
 from sidecar.core.control.session import ControlSession, ControlState
 
 if TYPE_CHECKING:

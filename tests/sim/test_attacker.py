@@ -14,7 +14,7 @@ from tests.sim.test_sealing import dropped, pair
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from protos.model import Address
+    from protos.model.ids import Address
     from tests.sim.mesh import Mesh, Node
 
 ELSEWHERE: Address = ("attacker.eth0", 666)

@@ -7,13 +7,14 @@ from typing import TYPE_CHECKING
 import pytest
 
 from controlplane.cli.explanation_text import render
-from protos.model import Role
+from protos.model.ids import Role
 from sidecar.core.robot.dispatch.penalties import FIRST_S, LONGEST_S
 from tests.sim.joined_planes import JoinedPlanes
 from tests.sim.mesh import SERVICE, Mesh, Node, rule
 
 if TYPE_CHECKING:
-    from protos.model import NodeName, ServiceMapping
+    from protos.model.ids import NodeName
+    from protos.model.mapping import ServiceMapping
 
 pytestmark = pytest.mark.audit("sec-2")
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from protos.model import InterfaceName, NodeName
+from protos.model.ids import InterfaceName, NodeName
 from sidecar.core.base.request_id import OBSERVED_ONE_IN
 from sidecar.core.base.values import PathState
 from sidecar.core.robot.request import request

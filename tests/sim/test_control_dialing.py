@@ -14,7 +14,7 @@ from itertools import pairwise
 
 import pytest
 
-from protos.model import Address, InterfaceName
+from protos.model.ids import Address, InterfaceName
 from sidecar.core.base.values import PathState
 from sidecar.core.control.race import ControlRace
 from sidecar.core.control.watch import CHEAPER, KEEPALIVE_S, SILENT, ControlWatch, Seen

@@ -4,17 +4,21 @@ from __future__ import annotations
 
 import dataclasses
 import random
+from typing import TYPE_CHECKING
 
 import pytest
 
 from controlplane.core.control.events import Settings
 from controlplane.core.policy.policy import CallRule, OfferRule, Policy
 from controlplane.core.publish.messages import CloseReason
-from protos.model import CandidateSet, InterfaceName, MappingSet, PeerSet, Role, ServiceSet, Version
-from protos.preferences import AT_MOST_EVERY_INTERFACE, Copies, InterfaceLabel
+from protos.model.ids import InterfaceName, Role, Version
+from protos.model.members import AT_MOST_EVERY_INTERFACE, CandidateSet, Copies, InterfaceLabel, PeerSet, ServiceSet
 from tests.sim.control_chaos import Chaos
 from tests.sim.control_world import SimSidecar, World
 from tests.unit.controlplane.samples import interfaces, offer, registration, use
+
+if TYPE_CHECKING:
+    from protos.model.mapping import MappingSet
 
 
 @pytest.mark.parametrize("seed", range(12))

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from protos.model import Role, ServiceOffer
+from protos.model.ids import Role
+from protos.model.members import ServiceOffer
 from sidecar.core.cloud import answers as answers_module
 from sidecar.core.seam.application import RequestFailed
 from sidecar.core.transfer import room as room_module

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from bench.evaluation.scenario import Scenario, read_scenarios
-from protos.redundancy_mode import RedundancyMode
+from protos.model.redundancy_mode import RedundancyMode
 from sidecar.core.rules.budget import Budget
 from tests.sim.drives import drive
 

@@ -10,7 +10,7 @@ from sidecar.core.wire.frame import BASE_BYTES
 from tests.sim.mesh import IPV6, Mesh, Node
 
 if TYPE_CHECKING:
-    from protos.model import Address
+    from protos.model.ids import Address
 
 
 def pair(delay_s: float = 0.01) -> tuple[Mesh, Node, Node]:

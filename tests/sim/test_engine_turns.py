@@ -11,8 +11,9 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from protos.model import InterfaceName, PeerSet, RemovalReason, RemovedPeer, ServiceName, ServiceOffer, Version
-from protos.redundancy_mode import RedundancyMode
+from protos.model.ids import InterfaceName, ServiceName, Version
+from protos.model.members import PeerSet, RemovalReason, RemovedPeer, ServiceOffer
+from protos.model.redundancy_mode import RedundancyMode
 from sidecar.core.engine.engine import Engine
 from sidecar.core.seam.application import RequestFailed
 from sidecar.core.seam.links import SetCarrier

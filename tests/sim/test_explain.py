@@ -11,21 +11,12 @@ from controlplane.core.control.events import Settings
 from controlplane.core.explain.explanation import UnknownNameError
 from controlplane.core.policy.path_rules import PathRule
 from controlplane.core.problem.problem import BlockKey
-from protos.explanation import AlternativeKind, Correlation, Explanation
-from protos.model import (
-    Assignment,
-    CandidateSet,
-    InterfaceJointReport,
-    InterfaceName,
-    JointReport,
-    NodeName,
-    Report,
-    Role,
-    ServiceName,
-    ServiceSet,
-)
-from protos.preferences import AT_MOST_EVERY_INTERFACE, InterfaceLabel
-from protos.status import SyncState
+from protos.model.explanation import AlternativeKind, Correlation, Explanation
+from protos.model.ids import InterfaceName, NodeName, Role, ServiceName
+from protos.model.mapping import Assignment
+from protos.model.members import AT_MOST_EVERY_INTERFACE, CandidateSet, InterfaceLabel, ServiceSet
+from protos.model.report import InterfaceJointReport, JointReport, Report
+from protos.model.status import SyncState
 from tests.sim.control_world import SimSidecar, World
 from tests.unit.controlplane.samples import PLAN, histogram, interfaces, latency, offer, path, registration, use
 

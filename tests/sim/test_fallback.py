@@ -6,7 +6,7 @@ from collections import Counter
 from functools import partial
 from typing import TYPE_CHECKING
 
-from protos.model import Role, ServiceName
+from protos.model.ids import Role, ServiceName
 from sidecar.core.robot.fallback.fallbacks import Fallbacks
 from sidecar.core.rules.fallback_rule import FallbackRule
 from sidecar.core.seam.application import DeadlineMissed, RequestFailed, ResponseArrived, Unreachable

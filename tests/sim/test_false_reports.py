@@ -8,17 +8,10 @@ from controlplane.cli.explanation_text import render
 from controlplane.core.control.events import Settings
 from controlplane.core.policy.policy import CallRule, OfferRule, Policy
 from protos.base.histogram import MAX_COUNT, Histogram
-from protos.model import (
-    Assignment,
-    CandidateSet,
-    InterfaceName,
-    LatencyReport,
-    NodeName,
-    Report,
-    Role,
-    ServiceName,
-    ServiceSet,
-)
+from protos.model.ids import InterfaceName, NodeName, Role, ServiceName
+from protos.model.mapping import Assignment
+from protos.model.members import CandidateSet, ServiceSet
+from protos.model.report import LatencyReport, Report
 from tests.sim.control_world import World
 from tests.unit.controlplane.samples import histogram, interfaces, latency, offer, registration, use
 

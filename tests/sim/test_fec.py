@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from protos.model import Role
+from protos.model.ids import Role
 from tests.sim.mesh import Mesh, Node, rule
 
 if TYPE_CHECKING:

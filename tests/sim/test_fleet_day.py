@@ -17,13 +17,14 @@ from controlplane.core.formulation.problem_builder import Drawing
 from controlplane.core.publish.snapshots import Track
 from controlplane.core.publish.views import Views
 from controlplane.core.registry.registry import Registry
-from protos.status import SyncState
+from protos.model.status import SyncState
 
 if TYPE_CHECKING:
     from pathlib import Path
 
     from controlplane.core.publish.snapshots import VersionSource
-    from protos.model import PeerSet, Version
+    from protos.model.ids import Version
+    from protos.model.members import PeerSet
 
 pytestmark = pytest.mark.audit("ops-24h")
 

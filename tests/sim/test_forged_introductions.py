@@ -6,14 +6,15 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from protos.model import InterfaceId, InterfaceName, NodeName, PeerSet, Role
+from protos.model.ids import InterfaceId, InterfaceName, NodeName, Role
 from sidecar.core.wire.frame import Header
 from sidecar.core.wire.introduction import encode_introduction
 from tests.sim.joined_planes import JoinedPlanes
 from tests.sim.mesh import Mesh, rule
 
 if TYPE_CHECKING:
-    from protos.model import Address, Peer
+    from protos.model.ids import Address
+    from protos.model.members import Peer, PeerSet
     from tests.sim.mesh import Node
 
 pytestmark = pytest.mark.audit("sec-5")

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from protos.model import Role
-from protos.redundancy_mode import RedundancyMode
+from protos.model.ids import Role
+from protos.model.redundancy_mode import RedundancyMode
 from sidecar.core.base.values import PathState
 from sidecar.core.link.liveness import PathKeeper
 from sidecar.core.path.probing import IDLE_PROBE_S, IDLE_SPREAD, MAX_IDLE_PROBE_S, WATCH_FACTOR

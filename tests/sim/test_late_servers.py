@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from protos.model import ServiceOffer
-from protos.redundancy_mode import RedundancyMode
+from protos.model.members import ServiceOffer
+from protos.model.redundancy_mode import RedundancyMode
 from sidecar.core.base.values import RejectReason
 from sidecar.core.robot.request.service_catalog import WITHDRAW_AFTER_S
 from sidecar.core.seam.application import ApplicationEvent, ExecuteRequest, RequestFailed, WithdrawService

@@ -7,7 +7,9 @@ from collections import Counter
 
 import pytest
 
-from protos.model import Assignment, InterfaceName, MappingSet, NodeName, Peer, PeerSet, ServiceMapping, Version
+from protos.model.ids import InterfaceName, NodeName, Version
+from protos.model.mapping import Assignment, MappingSet, ServiceMapping
+from protos.model.members import Peer, PeerSet
 from sidecar.core.path.path import DOWN_FLOOR_S
 from sidecar.core.path.probing import FIRST_PROBE_S
 from sidecar.core.seam.application import DeadlineMissed, OfferService, RequestFailed, WithdrawService

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from protos.redundancy_mode import RedundancyMode
+from protos.model.redundancy_mode import RedundancyMode
 from sidecar.core.rules.budget import Budget
 from tests.sim.joined_planes import JoinedPlanes
 from tests.sim.mesh import SERVICE, Mesh, Node, rule

@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Any
 import pytest
 from cryptography.hazmat.primitives.ciphers.aead import AESGCM, ChaCha20Poly1305
 
-from protos.model import PeerSet, Version
+from protos.model.ids import Version
+from protos.model.members import PeerSet
 from protos.trust.credential import Aead
 from sidecar.core.crypto import aead
 from sidecar.core.link.link import Link
@@ -18,7 +19,7 @@ from sidecar.core.wire import introduction
 from tests.sim.mesh import Mesh, Node
 
 if TYPE_CHECKING:
-    from protos.model import InterfaceName
+    from protos.model.ids import InterfaceName
 
 WORLDS = 24
 LEAST_SEALS = 200

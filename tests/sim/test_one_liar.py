@@ -7,7 +7,9 @@ import pytest
 from controlplane.core.control.events import Settings
 from controlplane.core.policy.policy import CallRule, OfferRule, Policy
 from controlplane.observe.fleet_metrics import families
-from protos.model import NodeName, RemovalReason, Report, Role, ServiceSet
+from protos.model.ids import NodeName, Role
+from protos.model.members import RemovalReason, ServiceSet
+from protos.model.report import Report
 from tests.sim.control_world import SETTLED_S, SimSidecar, World
 from tests.unit.controlplane.samples import PLAN, offer, path, registration
 from tests.unit.controlplane.scrapes import fleet_of, series, value

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from protos.model import NodeName
+from protos.model.ids import NodeName
 from sidecar.core.base.values import PathState
 from sidecar.core.path.probing import FIRST_PROBE_S
 from tests.sim.mesh import Mesh, rule

@@ -6,7 +6,7 @@ from functools import partial
 
 import pytest
 
-from protos.model import InterfaceName, NodeName
+from protos.model.ids import InterfaceName, NodeName
 from sidecar.core.path.pmtu import RETRY_S
 from sidecar.core.seam.links import SetMtu
 from sidecar.core.wire.frame import BASE_BYTES, MAX_DATAGRAM_BYTES

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from protos.model import Role
-from protos.redundancy_mode import RedundancyMode
+from protos.model.ids import Role
+from protos.model.redundancy_mode import RedundancyMode
 from tests.sim.mesh import Mesh, rule
 from tests.sim.serial_server import SerialServer
 

@@ -21,26 +21,17 @@ from controlplane.core.registry.registry import Refusal, StreamId
 from controlplane.serve import stream_encoder
 from controlplane.serve.stream_encoder import StreamEncoder
 from protos.convert import parse_control_message
-from protos.model import (
-    CandidateSet,
-    Drain,
-    NodeName,
-    PeerSet,
-    Registration,
-    ResourceKind,
-    Role,
-    ServiceName,
-    ServiceSet,
-    Welcome,
-)
-from protos.peer_changes import put_together
-from protos.status import SyncState
+from protos.model.ids import NodeName, Role, ServiceName
+from protos.model.members import CandidateSet, PeerSet, Registration, ServiceSet
+from protos.model.peer_changes import put_together
+from protos.model.status import SyncState
+from protos.model.stream import Drain, ResourceKind, Welcome
 from sidecar.core.control.session import Apply, ControlSession, ControlState
 from tests.unit.controlplane.samples import candidate, offer, registration, use
 
 if TYPE_CHECKING:
     from controlplane.core.control.events import Event
-    from protos.model import ControlMessage
+    from protos.model.stream import ControlMessage
 
 STEPS = 300
 PLAN = ServiceName("/plan")

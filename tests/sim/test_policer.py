@@ -12,7 +12,7 @@ from tests.sim.mesh import Mesh, rule
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from protos.model import Address
+    from protos.model.ids import Address
     from sidecar.core.base.values import ExecutionId
 
 MBIT = 1e6 / 8

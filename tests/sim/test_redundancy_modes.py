@@ -9,8 +9,8 @@ from dataclasses import dataclass
 import pytest
 
 from controlplane.core.estimate.estimator import Estimator
-from protos.model import InterfaceName
-from protos.redundancy_mode import RedundancyMode
+from protos.model.ids import InterfaceName
+from protos.model.redundancy_mode import RedundancyMode
 from sidecar.core.rules.budget import Budget
 from tests.sim.mesh import SERVICE, Mesh, Node, Wire, rule
 from tests.sim.test_mesh import assert_at_most_once, assert_each_answered_once, call_at, mapped

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import pytest
 
-from protos.model import Role, ServiceName, ServiceOffer
-from protos.redundancy_mode import RedundancyMode
+from protos.model.ids import Role, ServiceName
+from protos.model.members import ServiceOffer
+from protos.model.redundancy_mode import RedundancyMode
 from sidecar.core.base.values import Priority
 from sidecar.core.transfer import room as room_module
 from sidecar.core.transfer.room import SMALL_BYTES, Lane

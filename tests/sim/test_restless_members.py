@@ -7,7 +7,9 @@ import pytest
 from controlplane.core.control.events import Settings
 from controlplane.core.registry.registry import Refusal
 from controlplane.core.registry.restlessness import BYTES_BURST, BYTES_PER_S
-from protos.model import CandidateSet, Drain, NodeName, PeerSet, Role, ServiceSet
+from protos.model.ids import NodeName, Role
+from protos.model.members import CandidateSet, PeerSet, ServiceSet
+from protos.model.stream import Drain
 from tests.sim.control_world import SimSidecar, World
 from tests.unit.controlplane.samples import candidate, interfaces, offer, registration
 

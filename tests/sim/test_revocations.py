@@ -10,7 +10,7 @@ import pytest
 
 from controlplane.ca.authority import Authority
 from controlplane.ca.files import write_atomically, write_tls_files
-from protos.model import Role
+from protos.model.ids import Role
 from protos.program.tls_files import CRL_FILE, TlsWatch, load_tls_files
 from protos.trust.identity import IdentityRole
 from sidecar.control.announcement import Announcer
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
     from pathlib import Path
 
-    from protos.model import NodeName
+    from protos.model.ids import NodeName
     from protos.trust.credential import SessionCredential
     from sidecar.core.wire.messages import RevocationMessage
     from tests.sim.mesh import Node

@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING
 import pytest
 
 from protos.base.errors import DecodeError
-from protos.model import InterfaceId, PeerSet, Version
+from protos.model.ids import InterfaceId, Version
+from protos.model.members import PeerSet
 from protos.trust.credential import Aead
 from sidecar.core.path.key_exchange import KeyLimits
 from sidecar.core.wire import frame

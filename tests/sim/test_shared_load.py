@@ -6,7 +6,8 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from protos.model import Assignment, InterfaceName, MappingSet, NodeName, ServiceMapping, Version
+from protos.model.ids import InterfaceName, NodeName, Version
+from protos.model.mapping import Assignment, MappingSet, ServiceMapping
 from tests.sim.mesh import SERVICE, Mesh, Node, rule
 
 if TYPE_CHECKING:

@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from protos.model import Candidate, CandidateKind, InterfaceId, InterfaceName, PeerSet, Version
+from protos.model.ids import InterfaceId, InterfaceName, Version
+from protos.model.members import Candidate, CandidateKind, PeerSet
 from protos.trust.candidate_signature import sign_candidates
 from tests.sim.certified import CertifiedMesh
 
@@ -15,7 +16,8 @@ if TYPE_CHECKING:
     from collections.abc import Callable
     from pathlib import Path
 
-    from protos.model import Address, Peer
+    from protos.model.ids import Address
+    from protos.model.members import Peer
     from tests.sim.mesh import Mesh, Node
 
 pytestmark = pytest.mark.audit("sec-5")

@@ -26,7 +26,8 @@ from tests.sim.test_sealing import dropped, phases
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from protos.model import Address, Peer
+    from protos.model.ids import Address
+    from protos.model.members import Peer
     from protos.trust.credential import Aead
     from sidecar.core.crypto.key_schedule import PairKeys
 

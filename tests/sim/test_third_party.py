@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from protos.model import Candidate, CandidateKind, InterfaceId, InterfaceName, Role
+from protos.model.ids import InterfaceId, InterfaceName, Role
+from protos.model.members import Candidate, CandidateKind
 from sidecar.core.base.request_id import make_request_id
 from sidecar.core.base.values import PathState, Priority
 from sidecar.core.link.path_table import UNPROVEN_BYTES, UNPROVEN_BYTES_PER_S
@@ -20,7 +21,8 @@ from sidecar.core.wire.messages import RequestMessage, encode_message
 from tests.sim.mesh import SERVICE, TYPE, Mesh, rule
 
 if TYPE_CHECKING:
-    from protos.model import Address, Peer
+    from protos.model.ids import Address
+    from protos.model.members import Peer
     from sidecar.core.path.path import Path
     from tests.sim.mesh import Node
 

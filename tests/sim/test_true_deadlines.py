@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from protos.model import Role
+from protos.model.ids import Role
 from sidecar.core.base.values import Priority
 from sidecar.core.path.pmtu import HEADERS_V4
 from sidecar.core.seam.application import ExecuteRequest

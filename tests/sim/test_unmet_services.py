@@ -10,7 +10,8 @@ from controlplane.cli.status_table import render
 from controlplane.core.control.events import UnmetNotice
 from controlplane.core.explain.explanation import UnknownNameError
 from controlplane.core.policy.policy import CallRule, OfferRule, Policy
-from protos.model import NodeName, ServiceName, ServiceSet
+from protos.model.ids import NodeName, ServiceName
+from protos.model.members import ServiceSet
 from tests.sim.control_world import SETTLED_S, World
 from tests.unit.controlplane.samples import offer, use
 

@@ -11,7 +11,8 @@ from scipy.stats import beta
 from controlplane.core.estimate.estimator import Estimator
 from protos.base.histogram import Histogram
 from protos.base.size_class import size_class
-from protos.model import InterfaceName, LatencyReport, NodeName, PathReport, Report, ServiceName
+from protos.model.ids import InterfaceName, NodeName, ServiceName
+from protos.model.report import LatencyReport, PathReport, Report
 
 ROBOT, OTHER_ROBOT = NodeName("robot"), NodeName("other")
 DETECT, SEGMENT = ServiceName("/detect"), ServiceName("/segment")

@@ -23,7 +23,7 @@ from controlplane.observe.fleet_metrics import Fleet
 from controlplane.observe.metrics import Metrics
 from protos.base.histogram import Histogram
 from protos.convert.fields import MAX_CRL_BYTES
-from protos.model import InterfaceName, NodeName, ServiceName
+from protos.model.ids import InterfaceName, NodeName, ServiceName
 from protos.program.tls_files import MAX_FILE_BYTES
 from protos.trust.identity import MAX_CA_CERTIFICATES, Identity, IdentityRole, RevocationList
 from sidecar.config.sidecar import SidecarConfig

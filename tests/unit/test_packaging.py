@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 ROOT = Path(__file__).parents[2]
 
 SOLVER = ("ortools", "pandas", "grpc_health", "grpc_reflection")
-_COMMAND = {"protos.program.command_line": ("doctor",), "controlplane.cli.__main__": ("status",)}
+_COMMAND = {"protos.program.command_line": ("doctor",), "controlplane.cli": ("status",)}
 SIDECAR = ("pyroute2", "sdnotify", "zfec", "prometheus_client")
 
 
@@ -49,9 +49,10 @@ def test_a_sidecar_has_no_numpy_but_that_of_ros() -> None:
     modules = sorted(
         ".".join(file.relative_to(ROOT).with_suffix("").parts)
         for folder in ("sidecar/core", "sidecar/net")
-        for file in (ROOT / folder).glob("*.py")
+        for file in (ROOT / folder).rglob("*.py")
     )
-    counted = "from protos.histogram import Histogram\nh = Histogram(); h.record(1.0); h.merge(h.copy()); h.to_sparse()"
+    code = "h = Histogram(); h.record(1.0); h.merge(h.copy()); h.to_sparse()"
+    counted = f"from protos.base.histogram import Histogram\n{code}"
     done = without(
         ("numpy", *SOLVER), f"import {', '.join(modules)}, sidecar.observe.metrics\n{counted}; h.quantile(0.5)"
     )
@@ -62,7 +63,7 @@ def test_a_sidecar_has_no_numpy_but_that_of_ros() -> None:
 def test_an_operator_needs_no_extra() -> None:
     code = """
 import contextlib, io
-from controlplane.cli import main
+from controlplane.cli.__main__ import main
 for line in ("status --help", "explain --help", "events --help", "plan --help", "ca --help", "policy --help"):
     with contextlib.suppress(SystemExit), contextlib.redirect_stdout(io.StringIO()):
         main(line.split())
@@ -94,7 +95,7 @@ def test_a_program_without_its_extra_says_which(module: str, name: str, absent: 
         ("controlplane", "plr-controlplane", "controlplane", "cryptography"),
         ("sidecar", "plr-sidecar", "sidecar", "yaml"),
         ("protos.program.command_line", "plr", "sidecar", "pydantic"),
-        ("controlplane.cli.__main__", "plr", "controlplane", "grpc"),
+        ("controlplane.cli", "plr", "controlplane", "grpc"),
     ],
 )
 def test_a_program_without_a_dependency_says_what_to_install(module: str, name: str, extra: str, absent: str) -> None:
@@ -107,7 +108,7 @@ def test_a_program_without_a_dependency_says_what_to_install(module: str, name: 
 
 @pytest.mark.audit("ops-9")
 def test_planning_without_its_extra_says_which() -> None:
-    done = start("controlplane.cli.__main__", ("numpy",), "plan", "--recorded", "none.json")
+    done = start("controlplane.cli", ("numpy",), "plan", "--recorded", "none.json")
     assert done.returncode == 2
     assert done.stderr == (
         "plr plan: numpy not installed: needs the extra controlplane; in the checkout: pip install '.[controlplane]'\n"

@@ -24,16 +24,8 @@ from cryptography.hazmat.primitives.ciphers.aead import AESGCM, ChaCha20Poly1305
 from cryptography.hazmat.primitives.serialization import Encoding
 
 from protos.base.errors import DecodeError
-from protos.model import (
-    PROTOCOL_VERSION,
-    Candidate,
-    CandidateKind,
-    InterfaceId,
-    InterfaceName,
-    NodeName,
-    Role,
-    ServiceName,
-)
+from protos.model.ids import PROTOCOL_VERSION, InterfaceId, InterfaceName, NodeName, Role, ServiceName
+from protos.model.members import Candidate, CandidateKind
 from protos.trust.candidate_signature import signed_bytes, verify_candidates
 from protos.trust.credential import Aead, SessionCredential, decode_credential, session_number, verify
 from protos.trust.identity import Trust

@@ -18,23 +18,9 @@ from typing import TYPE_CHECKING, Any
 from bench.dataplane.calling import HEADER, Caller, Plan, usage
 from bench.dataplane.remote import serve
 from bench.null_cipher import install
-from protos.model import (
-    ALL_CALLS,
-    Assignment,
-    Candidate,
-    CandidateKind,
-    InterfaceName,
-    MappingSet,
-    NodeName,
-    Peer,
-    PeerSet,
-    Role,
-    ServiceMapping,
-    ServiceName,
-    ServiceOffer,
-    SessionId,
-    Version,
-)
+from protos.model.ids import InterfaceName, NodeName, Role, ServiceName, SessionId, Version
+from protos.model.mapping import Assignment, MappingSet, ServiceMapping
+from protos.model.members import ALL_CALLS, Candidate, CandidateKind, Peer, PeerSet, ServiceOffer
 from protos.program import interpreter
 from protos.trust.clock_floor import ClockFloor
 from protos.trust.pair_token import pair_token

@@ -52,32 +52,22 @@ from controlplane.core.registry.restlessness import Restlessness
 from controlplane.core.settle.explored_pair import Exploration
 from controlplane.core.settle.stability import Stability
 from protos.base.errors import DecodeError
-from protos.fleet_events import Why
-from protos.model import (
-    Ack,
-    CandidateSet,
-    Drain,
-    Heartbeat,
-    MappingSet,
-    Nack,
-    Registration,
-    RemovalReason,
-    Report,
-    ResourceKind,
-    RevocationSet,
-    Role,
-    ServiceSet,
-    Welcome,
-)
+from protos.model.fleet_events import Why
+from protos.model.ids import Role
+from protos.model.mapping import MappingSet
+from protos.model.members import CandidateSet, Registration, RemovalReason, RevocationSet, ServiceSet
+from protos.model.report import Report
+from protos.model.stream import Ack, Drain, Heartbeat, Nack, ResourceKind, Welcome
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Iterable, Iterator, Set
 
     from controlplane.core.policy.policy import Policy
     from controlplane.core.registry.registry import Sidecar
-    from protos.explanation import Explanation
-    from protos.model import NodeName, ServiceName, SidecarMessage
-    from protos.status import SidecarStatus, SyncState
+    from protos.model.explanation import Explanation
+    from protos.model.ids import NodeName, ServiceName
+    from protos.model.status import SidecarStatus, SyncState
+    from protos.model.stream import SidecarMessage
 
 RESTLESS_DELAY_S = 1.0
 """The same, for a member that comes and goes beyond its share."""

@@ -13,7 +13,8 @@ if TYPE_CHECKING:
     from controlplane.core.explain.departed import Departure
     from controlplane.core.policy.path_rules import PathRule
     from controlplane.core.policy.policy import Policy
-    from protos.model import Nack, NodeName, ResourceKind, Role, ServiceName
+    from protos.model.ids import NodeName, Role, ServiceName
+    from protos.model.stream import Nack, ResourceKind
 
 
 @dataclass(frozen=True, slots=True)

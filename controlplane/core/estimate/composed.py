@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
     from controlplane.core.estimate.network import RobotNetwork, Witness
     from controlplane.core.estimate.processing import ServerTimes
-    from protos.model import InterfaceName, NodeName
+    from protos.model.ids import InterfaceName, NodeName
 
 MODEL_REQUESTS = 5.0
 """What an estimate from parts (network and processing) is worth in real requests of the very service ..."""

@@ -25,7 +25,7 @@ from controlplane.core.estimate.shared_fate import SharedFate
 from controlplane.core.estimate.staleness import HeardClock
 from protos.base.histogram import Histogram
 from protos.base.size_class import SIZE_CLASSES
-from protos.explanation import SAMPLE
+from protos.model.explanation import SAMPLE
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
@@ -36,17 +36,9 @@ if TYPE_CHECKING:
     from controlplane.core.estimate.composed import Parts
     from controlplane.core.estimate.network import PathState
     from controlplane.core.estimate.shared_fate import CommonMisses
-    from protos.model import (
-        Assignment,
-        InterfaceName,
-        JointReport,
-        LatencyReport,
-        NodeName,
-        PathReport,
-        PenaltyReport,
-        Report,
-        ServiceName,
-    )
+    from protos.model.ids import InterfaceName, NodeName, ServiceName
+    from protos.model.mapping import Assignment
+    from protos.model.report import JointReport, LatencyReport, PathReport, PenaltyReport, Report
 
     Pair = tuple[InterfaceName, NodeName, ServiceName]
     JointKey = tuple[ServiceName, Assignment, Assignment]
@@ -96,7 +88,7 @@ LIVE_S = 60.0
 
 @dataclass(frozen=True, slots=True)
 class Evidence:
-    """What an estimate rests on; histograms count `protos.explanation.SAMPLE` for a sample that has not faded."""
+    """What an estimate rests on; histograms count `protos.model.explanation.SAMPLE` for a sample that has not faded."""
 
     requests: float
     probes: float

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 from controlplane.core.estimate.posterior import Estimate
 
 if TYPE_CHECKING:
-    from protos.model import InterfaceName, NodeName
+    from protos.model.ids import InterfaceName, NodeName
 
 SUREST = 1e-9
 """Nothing is taken to be more probable than 1 less this, nor less probable than this."""

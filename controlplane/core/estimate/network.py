@@ -27,7 +27,8 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from controlplane.core.estimate.distribution import Distribution
-    from protos.model import InterfaceName, LatencyReport, NodeName, PathReport
+    from protos.model.ids import InterfaceName, NodeName
+    from protos.model.report import LatencyReport, PathReport
 
     PathKey = tuple[InterfaceName, NodeName]
     CellKey = tuple[InterfaceName, NodeName, int]

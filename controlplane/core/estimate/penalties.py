@@ -8,12 +8,12 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from protos.model import PenaltyReport
+from protos.model.report import PenaltyReport
 
 if TYPE_CHECKING:
     from collections.abc import Collection
 
-    from protos.model import NodeName
+    from protos.model.ids import NodeName
 
 LONGEST_S = 600.0
 """No sidecar keeps a server out for longer (`sidecar.core.robot.dispatch.penalties`), whatever it says."""

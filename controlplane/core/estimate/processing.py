@@ -15,7 +15,7 @@ from controlplane.core.estimate.witnesses import COUNTS_ANYWAY, Witnesses
 from protos.base.histogram import Histogram
 
 if TYPE_CHECKING:
-    from protos.model import NodeName, ServiceName
+    from protos.model.ids import NodeName, ServiceName
 
 MAX_PROCESSING = 8192
 """Processing histograms kept, one for each (server, service); the least recently reported goes."""

@@ -15,10 +15,10 @@ import numpy as np
 
 from controlplane.core.estimate.beta import quantiles
 from controlplane.core.estimate.posterior import BATCH_S, MAX_BATCH_CORRELATION, USUAL_STREAK, USUAL_STREAK_BATCHES
-from protos.explanation import Correlation
+from protos.model.explanation import Correlation
 
 if TYPE_CHECKING:
-    from protos.model import InterfaceJointReport
+    from protos.model.report import InterfaceJointReport
 
 HALF_LIFE_S = 600.0
 """Carriers do not change, places do: trouble a few minutes apart counts together, that of another district does not."""

@@ -19,7 +19,8 @@ from protos.base.histogram import MAX_COUNT
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterable
 
-    from protos.model import LatencyReport, NodeName, ServiceName
+    from protos.model.ids import NodeName, ServiceName
+    from protos.model.report import LatencyReport
 
     Pair = tuple[NodeName, ServiceName]
 

@@ -18,7 +18,7 @@ from controlplane.core.estimate.fading import FadedCount
 from protos.base.histogram import Histogram
 
 if TYPE_CHECKING:
-    from protos.model import NodeName
+    from protos.model.ids import NodeName
 
 MAX_WITNESSES = 64
 """Robots remembered for each server and service, the one that reported least recently goes."""

@@ -13,8 +13,8 @@ from controlplane.core.problem.domains import shared_domains
 from controlplane.core.problem.plan import choice_of
 from controlplane.core.problem.problem import FleetKey, block_excess, loads, reachable
 from controlplane.core.solve.enumeration import MAX_LISTED, list_choices, own_excess
-from protos.explanation import Alternative, AlternativeKind
-from protos.model import Assignment
+from protos.model.explanation import Alternative, AlternativeKind
+from protos.model.mapping import Assignment
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
     from controlplane.core.problem.plan import Plan
     from controlplane.core.problem.problem import Block, Choice, Problem
-    from protos.model import NodeName
+    from protos.model.ids import NodeName
 
 OTHERS = 3
 """Best mappings told of that are not in force."""

@@ -13,8 +13,8 @@ from itertools import islice
 from typing import TYPE_CHECKING
 
 from controlplane.core.problem.problem import BlockKey
-from protos.fleet_events import DepartedSidecar, Why
-from protos.model import RemovalReason
+from protos.model.fleet_events import DepartedSidecar, Why
+from protos.model.members import RemovalReason
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
@@ -25,8 +25,9 @@ if TYPE_CHECKING:
     from controlplane.core.problem.problem import Objective
     from controlplane.core.publish.snapshots import Snapshots
     from controlplane.core.registry.registry import Sidecar
-    from protos.model import InterfaceName, NodeName, Role, ServiceMapping, ServiceName
-    from protos.status import ResourceStatus
+    from protos.model.ids import InterfaceName, NodeName, Role, ServiceName
+    from protos.model.mapping import ServiceMapping
+    from protos.model.status import ResourceStatus
 
 MAX_DEPARTED = 4096
 """Sidecars that are gone and remembered, who went longest ago goes: as many as can be registered."""

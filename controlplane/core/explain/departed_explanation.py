@@ -9,7 +9,7 @@ from controlplane.core.explain.explanation import UnknownNameError, explain, fin
 from controlplane.core.formulation.block import Picture
 from controlplane.core.problem.plan import Plan
 from controlplane.core.problem.problem import BlockKey, Problem
-from protos.explanation import SAMPLE
+from protos.model.explanation import SAMPLE
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
@@ -18,8 +18,10 @@ if TYPE_CHECKING:
     from controlplane.core.estimate.shared_fate import CommonMisses
     from controlplane.core.explain.departed import Departure, LastKnown
     from controlplane.core.publish.history import MappingHistory
-    from protos.explanation import Explanation
-    from protos.model import Assignment, InterfaceName, NodeName, PenaltyReport, ServiceName
+    from protos.model.explanation import Explanation
+    from protos.model.ids import InterfaceName, NodeName, ServiceName
+    from protos.model.mapping import Assignment
+    from protos.model.report import PenaltyReport
 
 
 class _LastEstimates:

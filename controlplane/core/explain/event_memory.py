@@ -13,7 +13,7 @@ from protos.base.token_bucket import TokenBucket
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from protos.fleet_events import FleetEvent
+    from protos.model.fleet_events import FleetEvent
 
     Owner = str | None
 

@@ -13,8 +13,9 @@ from controlplane.core.explain import alternatives
 from controlplane.core.formulation.block import BlockNotes, interfaces_of
 from controlplane.core.problem.mode_miss import miss_of, predicted_miss
 from controlplane.core.problem.problem import BlockKey
-from protos.explanation import Belief, Explanation, JointExplanation, MappingChange, PairExplanation
-from protos.model import Assignment, Role
+from protos.model.explanation import Belief, Explanation, JointExplanation, MappingChange, PairExplanation
+from protos.model.ids import Role
+from protos.model.mapping import Assignment
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterable, Iterator, Mapping
@@ -28,8 +29,11 @@ if TYPE_CHECKING:
     from controlplane.core.problem.problem import Block, Choice
     from controlplane.core.publish.history import History
     from controlplane.core.registry.registry import Registry, Sidecar
-    from protos.model import InterfaceName, NodeName, PenaltyReport, ServiceMapping, ServiceName, ServiceUse
-    from protos.status import ResourceStatus
+    from protos.model.ids import InterfaceName, NodeName, ServiceName
+    from protos.model.mapping import ServiceMapping
+    from protos.model.members import ServiceUse
+    from protos.model.report import PenaltyReport
+    from protos.model.status import ResourceStatus
 
 LEVEL = 0.9
 """Of the intervals told with a probability."""

@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING
 from controlplane.core.formulation.block import interfaces_of
 from controlplane.core.problem.mode_miss import NO_SENDING, predicted_miss
 from controlplane.core.problem.problem import BlockKey
-from protos.model import Role
-from protos.status import SyncState
+from protos.model.ids import Role
+from protos.model.status import SyncState
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -25,7 +25,9 @@ if TYPE_CHECKING:
     from controlplane.core.problem.plan import Plan
     from controlplane.core.publish.snapshots import Snapshots
     from controlplane.core.registry.registry import Sidecar
-    from protos.model import InterfaceName, NodeName, ServiceMapping, ServiceName, ServiceUse
+    from protos.model.ids import InterfaceName, NodeName, ServiceName
+    from protos.model.mapping import ServiceMapping
+    from protos.model.members import ServiceUse
 
 MAX_VIEWED = 512
 """Paths, and services, of one robot that are looked at."""

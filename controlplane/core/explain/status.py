@@ -6,7 +6,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from controlplane.core.formulation.block import interfaces_of
-from protos.status import SidecarStatus
+from protos.model.status import SidecarStatus
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from controlplane.core.policy.permits import Permits
     from controlplane.core.publish.publisher import Publisher
     from controlplane.core.registry.registry import Registry
-    from protos.model import NodeName, ServiceName
+    from protos.model.ids import NodeName, ServiceName
 
 
 def is_met(robot: NodeName, server: NodeName, registry: Registry, permits: Permits) -> bool:
@@ -68,7 +68,7 @@ def statuses(
             services=() if shorter else services,
             paths=() if shorter else paths,
             refused_offers=permits.refused_offers(sidecar),
-            revocations=sidecar.control.revocations,
+            revocations=sidecar.revocations,
             unmet=sidecar.unmet,
             untyped=sidecar.untyped,
             unreached=sidecar.unreached,

@@ -21,7 +21,8 @@ if TYPE_CHECKING:
     from controlplane.core.problem.mode_miss import PairTiming
     from controlplane.core.problem.problem import Path
     from controlplane.core.registry.registry import Sidecar
-    from protos.model import InterfaceName, NodeName, ServiceUse
+    from protos.model.ids import InterfaceName, NodeName
+    from protos.model.members import ServiceUse
 
 
 KEPT_PAIRS = 8

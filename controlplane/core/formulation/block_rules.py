@@ -6,14 +6,15 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from controlplane.core.problem.problem import Target
-from protos.preferences import InterfaceLabel
+from protos.model.members import InterfaceLabel
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
     from controlplane.core.problem.problem import Block
     from controlplane.core.registry.registry import Sidecar
-    from protos.model import ServiceName, ServiceUse
+    from protos.model.ids import ServiceName
+    from protos.model.members import ServiceUse
 
 
 def with_rules(block: Block, robot: Sidecar, use: ServiceUse, clouds: Iterable[Sidecar]) -> Block:

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 from controlplane.core.formulation.block import BlockNotes, Picture, draw_block, interfaces_of
 from controlplane.core.policy.path_rules import PathRules
 from controlplane.core.problem.problem import BlockKey, FleetKey, Problem
-from protos.model import Role
+from protos.model.ids import Role
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
@@ -25,8 +25,9 @@ if TYPE_CHECKING:
     from controlplane.core.policy.permits import Group, Permits
     from controlplane.core.problem.problem import Block, Objective
     from controlplane.core.registry.registry import Sidecar
-    from protos.model import InterfaceName, NodeName, Registration, Report, ServiceName, ServiceOffer, ServiceUse
-    from protos.preferences import InterfaceLabel
+    from protos.model.ids import InterfaceName, NodeName, ServiceName
+    from protos.model.members import InterfaceLabel, Registration, ServiceOffer, ServiceUse
+    from protos.model.report import Report
 
 SLICE_PAIRS = 40
 """Pairs (interface, server) estimated at a time: some milliseconds, for which streams wait."""

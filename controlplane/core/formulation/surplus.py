@@ -16,7 +16,8 @@ if TYPE_CHECKING:
     from controlplane.core.estimate.posterior import Estimate
     from controlplane.core.problem.problem import Block
     from controlplane.core.registry.registry import Sidecar
-    from protos.model import InterfaceName, NodeName, ServiceUse
+    from protos.model.ids import InterfaceName, NodeName
+    from protos.model.members import ServiceUse
 
 MAX_PLANNED = 8
 """Interfaces of one robot in one mapping: as many copies of a request a robot sends at most."""

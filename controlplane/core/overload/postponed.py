@@ -11,7 +11,7 @@ from controlplane.core.base.member_table import MemberTable
 from protos.base.token_bucket import TokenBucket
 
 if TYPE_CHECKING:
-    from protos.model import NodeName
+    from protos.model.ids import NodeName
 
 COUNTED_BURST = 2.0
 """Times that one member counts at once."""

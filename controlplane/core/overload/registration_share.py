@@ -11,7 +11,7 @@ from controlplane.core.base.member_table import MemberTable
 from protos.base.token_bucket import TokenBucket
 
 if TYPE_CHECKING:
-    from protos.model import NodeName
+    from protos.model.ids import NodeName
 
 STARTS_BURST = 30.0
 """A day of somebody who looks for a mistake, in minutes."""

@@ -20,7 +20,7 @@ from controlplane.core.base.member_table import MemberTable
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from protos.model import NodeName
+    from protos.model.ids import NodeName
 
 ENTRIES_PER_S = 2000.0
 """Entries of reports, each some 40 us to take at most: a robot with 8 interfaces that calls 4 services on 16 servers

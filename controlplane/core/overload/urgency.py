@@ -12,7 +12,7 @@ from controlplane.core.base.member_table import MemberTable
 from protos.base.token_bucket import TokenBucket
 
 if TYPE_CHECKING:
-    from protos.model import NodeName
+    from protos.model.ids import NodeName
 
 PAIRS_BURST = 2000.0
 """Pairs (interface, server) of one robot that are drawn at once, those of all its services: a small robot's news some

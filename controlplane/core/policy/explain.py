@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
 
     from controlplane.core.policy.policy import Policy
-    from protos.model import NodeName, ServiceName
+    from protos.model.ids import NodeName, ServiceName
 
 
 MAX_CLOSE = 5

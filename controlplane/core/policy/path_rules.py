@@ -15,7 +15,7 @@ from controlplane.core.policy.patterns import matches
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterable, Sequence
 
-    from protos.model import InterfaceName, NodeName
+    from protos.model.ids import InterfaceName, NodeName
 
 MAX_PATH_RULES = 1024
 """Rules in the list."""

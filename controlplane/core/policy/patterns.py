@@ -12,7 +12,7 @@ import re
 import string
 
 MAX_PATTERN_CHARACTERS = 255
-"""No name is longer (protos/base/names.py)."""
+"""No name is longer (protos/model/names.py)."""
 
 _LETTERS = frozenset(string.ascii_letters)
 _GRAPHIC = frozenset(map(chr, range(ord("!"), ord("~") + 1))) - {"/"}
@@ -29,7 +29,7 @@ class NameKind(enum.Enum):
 
 _State = tuple[tuple[frozenset[str], int], ...]
 _STATES: dict[NameKind, tuple[tuple[_State, ...], int]] = {
-    # What protos/base/names.py lets through, as automata: where each state leads by which characters; the last one accepts.
+    # What `protos.model.names` lets pass, as automata: where each state leads by which characters; the last one accepts.
     NameKind.NODE: ((((_ALNUM, 1),), ((_ALNUM | frozenset("_.-"), 1),)), 1),
     # Printable ASCII but for the slash.
     NameKind.INTERFACE: ((((_GRAPHIC, 1),), ((_GRAPHIC, 1),)), 1),

@@ -10,12 +10,12 @@ from typing import TYPE_CHECKING
 
 from controlplane.core.policy.pattern_index import PatternIndex
 from controlplane.core.registry.registry import MAX_SIDECARS
-from protos.model import ALL_CALLS, NO_POLICY, CallPermit
+from protos.model.members import ALL_CALLS, NO_POLICY, CallPermit
 
 if TYPE_CHECKING:
     from controlplane.core.policy.policy import Policy
     from controlplane.core.registry.registry import Sidecar
-    from protos.model import NodeName, ServiceName
+    from protos.model.ids import NodeName, ServiceName
 
 MAX_GROUPED = 2 * MAX_SIDECARS
 """Robots whose group is kept; then all are worked out anew."""

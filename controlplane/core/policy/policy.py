@@ -13,10 +13,10 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from controlplane.core.policy.patterns import matches
-from protos.model import NO_POLICY
+from protos.model.members import NO_POLICY
 
 if TYPE_CHECKING:
-    from protos.model import NodeName, ServiceName
+    from protos.model.ids import NodeName, ServiceName
 
 MAX_RULES = 1024
 """Rules in one list."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from protos.model import NodeName, ServiceName
+    from protos.model.ids import NodeName, ServiceName
 
 MAX_TOLD = 1024
 """Services of one cloud that are told of: as many as it may offer at once. Further ones are counted only."""

@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from controlplane.core.problem.objectives import PROBABILITY_FLOOR, joint_miss
-from protos.redundancy_mode import RedundancyMode
+from protos.model.redundancy_mode import RedundancyMode
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -29,7 +29,8 @@ if TYPE_CHECKING:
 
     from controlplane.core.problem.plan import BlockPlan
     from controlplane.core.problem.problem import Block, Choice, Path
-    from protos.model import InterfaceName, NodeName, ServiceUse
+    from protos.model.ids import InterfaceName, NodeName
+    from protos.model.members import ServiceUse
 
     Pair = tuple[InterfaceName, NodeName]
 

@@ -20,7 +20,8 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from controlplane.core.problem.problem import Block, BlockKey, Choice, FleetKey, Problem
-    from protos.model import Assignment, InterfaceName, NodeName
+    from protos.model.ids import InterfaceName, NodeName
+    from protos.model.mapping import Assignment
 
 
 @dataclass(frozen=True, slots=True)

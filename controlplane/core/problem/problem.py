@@ -24,12 +24,12 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, NamedTuple
 
 from controlplane.core.estimate.posterior import Estimate
-from protos.preferences import EVERY_INTERFACE, Copies
+from protos.model.members import EVERY_INTERFACE, Copies
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
 
-    from protos.model import InterfaceName, NodeName, ServiceName
+    from protos.model.ids import InterfaceName, NodeName, ServiceName
 
 
 class BlockKey(NamedTuple):

@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING
 from controlplane.core.problem.problem import BlockKey
 
 if TYPE_CHECKING:
-    from protos.model import MappingSet, NodeName, ServiceMapping, Version
+    from protos.model.ids import NodeName, Version
+    from protos.model.mapping import MappingSet, ServiceMapping
 
 MAX_CHANGES = 8
 """Changes remembered of one robot's service: two minutes of the most that are made for the better."""

@@ -8,7 +8,8 @@ from controlplane.core.formulation.block import interfaces_of
 from controlplane.core.formulation.surplus import MAX_PLANNED
 from controlplane.core.problem.mode_miss import predicted_miss
 from controlplane.core.problem.problem import BlockKey, Objective
-from protos.model import NO_CALLS, Assignment, ServiceMapping
+from protos.model.mapping import Assignment, ServiceMapping
+from protos.model.members import NO_CALLS
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Mapping
@@ -16,7 +17,8 @@ if TYPE_CHECKING:
     from controlplane.core.formulation.block import BlockNotes, Picture
     from controlplane.core.problem.plan import BlockPlan, Plan
     from controlplane.core.registry.registry import Sidecar
-    from protos.model import CallPermit, InterfaceName, NodeName, ServiceName
+    from protos.model.ids import InterfaceName, NodeName, ServiceName
+    from protos.model.members import CallPermit
 
 PREDICTION_CHANGE = 2.0
 """A new predicted miss probability alone is sent when it differs by this factor: it informs, nothing acts on it."""

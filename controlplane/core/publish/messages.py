@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from controlplane.core.registry.registry import StreamId
-    from protos.model import ControlMessage
+    from protos.model.stream import ControlMessage
 
 
 class CloseReason(enum.Enum):

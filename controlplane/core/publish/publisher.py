@@ -29,7 +29,9 @@ from controlplane.core.publish.snapshots import PeerView, Snapshots, VersionSour
 from controlplane.core.publish.told_peers import ToldPeers
 from controlplane.core.publish.views import KnownPeers, Views
 from controlplane.core.registry.registry import MAX_SIDECARS
-from protos.model import POLICY_PENDING, ResourceKind, Role, Version
+from protos.model.ids import Role, Version
+from protos.model.members import POLICY_PENDING
+from protos.model.stream import ResourceKind
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
@@ -38,8 +40,10 @@ if TYPE_CHECKING:
     from controlplane.core.policy.permits import Permits
     from controlplane.core.problem.plan import Plan
     from controlplane.core.registry.registry import Registry, Sidecar, StreamId
-    from protos.model import Ack, Nack, NodeName, Registration
-    from protos.status import SyncState
+    from protos.model.ids import NodeName
+    from protos.model.members import Registration
+    from protos.model.status import SyncState
+    from protos.model.stream import Ack, Nack
 
 MAX_GONE_SNAPSHOTS = MAX_SIDECARS
 """Sidecars that are gone and whose last set is remembered, for the notices when they return; the oldest go."""

@@ -15,7 +15,8 @@ from protos.trust.pair_token import pair_token
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from protos.model import NodeName, Peer, Role
+    from protos.model.ids import NodeName, Role
+    from protos.model.members import Peer
 
 
 class ToldPeers(Sequence["Peer"]):

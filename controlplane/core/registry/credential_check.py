@@ -9,7 +9,7 @@ from protos.base.errors import DecodeError
 from protos.trust.credential import decode_credential, verify
 
 if TYPE_CHECKING:
-    from protos.model import Registration
+    from protos.model.members import Registration
     from protos.trust.identity import Identity
 
 

@@ -14,22 +14,14 @@ from typing import TYPE_CHECKING, NewType
 
 from controlplane.core.overload.postponed import Postponed
 from controlplane.core.overload.registration_share import RegistrationShare
-from protos.model import (
-    NO_REVOCATIONS,
-    CandidateSet,
-    NodeName,
-    Peer,
-    Registration,
-    RemovalReason,
-    RevocationSet,
-    Role,
-)
+from protos.model.ids import NodeName, Role
+from protos.model.members import NO_REVOCATIONS, CandidateSet, Peer, Registration, RemovalReason, RevocationSet
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterator
 
-    from protos.model import Candidate, ServiceName, ServiceOffer, ServiceSet, ServiceUse, SessionId
-    from protos.preferences import InterfaceLabel
+    from protos.model.ids import ServiceName, SessionId
+    from protos.model.members import Candidate, InterfaceLabel, ServiceOffer, ServiceSet, ServiceUse
 
 StreamId = NewType("StreamId", int)
 """Number of one stream, unique in one run of the control plane."""

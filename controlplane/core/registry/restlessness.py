@@ -16,7 +16,8 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Collection
 
     from controlplane.core.registry.registry import StreamId
-    from protos.model import CandidateSet, NodeName, ServiceSet
+    from protos.model.ids import NodeName
+    from protos.model.members import CandidateSet, ServiceSet
 
     Announcement = CandidateSet | ServiceSet
 

@@ -11,14 +11,14 @@ import math
 from typing import TYPE_CHECKING, NamedTuple
 
 from controlplane.core.problem.plan import choice_of
-from protos.model import Assignment
+from protos.model.mapping import Assignment
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
     from controlplane.core.problem.plan import BlockPlan, Plan
     from controlplane.core.problem.problem import Block, BlockKey, Choice, Problem
-    from protos.model import InterfaceName, NodeName
+    from protos.model.ids import InterfaceName, NodeName
 
 TRIALS = 6.0
 """What a robot that explores sends within half a minute or more."""

@@ -16,7 +16,7 @@ from protos.base.errors import DecodeError
 from protos.stun.codec import MessageClass, StunMessage, decode, encode, is_stun
 
 if TYPE_CHECKING:
-    from protos.model import Address
+    from protos.model.ids import Address
 
 UNKNOWN_ATTRIBUTE_CODE = 420
 

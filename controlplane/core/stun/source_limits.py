@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 from protos.base.token_bucket import TokenBucket
 
 if TYPE_CHECKING:
-    from protos.model import Address
+    from protos.model.ids import Address
 
 ANSWERS_PER_S = 50.0
 """To one source: a hundred robots behind one carrier's NAT, each asking every few seconds."""

@@ -159,7 +159,7 @@ class Register(_message.Message):
     role: _types_pb2.Role.ValueType
     session: _builtins.int
     token: _builtins.bytes
-    """Its own secret, for the control plane alone; peers are told what follows from it for each (protos/trust/pair_token.py)."""
+    """Its own secret, for the control plane alone; peers are told what follows from it for each (trust/pair_token.py)."""
     incarnation: _builtins.int
     software_version: _builtins.str
     peers_version: _builtins.int

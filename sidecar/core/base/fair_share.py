@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from protos.model import NodeName
+    from protos.model.ids import NodeName
 
 FORGOTTEN_AT_ONCE = 128
 """Old entries that a table forgets in one call, the rest in the next ones: less than a millisecond after any burst."""

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 from sidecar.core.base.values import RequestId
 
 if TYPE_CHECKING:
-    from protos.model import SessionId
+    from protos.model.ids import SessionId
 
 REQUEST_ID_BYTES = 16
 OBSERVED_ONE_IN = 8

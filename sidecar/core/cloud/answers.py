@@ -30,7 +30,7 @@ from sidecar.core.wire.messages import RejectionMessage, ResponseMessage, encode
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterable, Iterator
 
-    from protos.model import NodeName
+    from protos.model.ids import NodeName
     from sidecar.core.base.slices import Backlog, Step
     from sidecar.core.base.values import PathId, RequestId
     from sidecar.core.cloud.executions import Reply

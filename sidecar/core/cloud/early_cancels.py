@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 from sidecar.core.base.fair_share import FORGOTTEN_AT_ONCE, Shares
 
 if TYPE_CHECKING:
-    from protos.model import NodeName
+    from protos.model.ids import NodeName
     from sidecar.core.base.values import RequestId
     from sidecar.core.seam.stats import EngineStats
 

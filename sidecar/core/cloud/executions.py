@@ -31,7 +31,7 @@ from sidecar.core.wire.messages import MAX_PAYLOAD_BYTES, RejectionMessage, Resp
 if TYPE_CHECKING:
     from collections.abc import Collection
 
-    from protos.model import NodeName, ServiceName
+    from protos.model.ids import NodeName, ServiceName
     from sidecar.core.base.slices import Backlog
     from sidecar.core.base.values import PathId, Priority
     from sidecar.core.seam.stats import EngineStats

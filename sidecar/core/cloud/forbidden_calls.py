@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 from sidecar.core.seam.application import CallsForbidden
 
 if TYPE_CHECKING:
-    from protos.model import NodeName, ServiceName
+    from protos.model.ids import NodeName, ServiceName
 
 TELL_EVERY_S = 10.0
 """Between two notices on one robot."""

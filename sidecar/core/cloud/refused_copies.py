@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, NamedTuple
 from sidecar.core.base.fair_share import FORGOTTEN_AT_ONCE, Shares
 
 if TYPE_CHECKING:
-    from protos.model import NodeName
+    from protos.model.ids import NodeName
     from sidecar.core.base.values import RejectReason, RequestId
     from sidecar.core.seam.stats import EngineStats
 

@@ -18,7 +18,8 @@ from sidecar.core.seam.application import ExecuteRequest
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Iterable
 
-    from protos.model import NodeName, ServiceName, ServiceOffer
+    from protos.model.ids import NodeName, ServiceName
+    from protos.model.members import ServiceOffer
     from sidecar.core.base.slices import Backlog, Step
     from sidecar.core.base.values import ExecutionId, PathId, RequestId
     from sidecar.core.seam.application import ApplicationEvent

@@ -5,8 +5,9 @@ from __future__ import annotations
 from collections import Counter
 from dataclasses import replace
 
-from protos.model import MAX_PEERS, PeerSet, Version
-from protos.peer_changes import put_upon
+from protos.model.ids import Version
+from protos.model.members import MAX_PEERS, PeerSet
+from protos.model.peer_changes import put_upon
 
 
 class PeerAssembly:

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 from sidecar.core.control.ways import Life
 
 if TYPE_CHECKING:
-    from protos.model import InterfaceName
+    from protos.model.ids import InterfaceName
     from sidecar.core.control.ways import ControlWays, Way
 
 SILENT_S = 1.0

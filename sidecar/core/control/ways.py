@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from collections import Counter
     from collections.abc import Iterable, Mapping, Sequence
 
-    from protos.model import Address, InterfaceName
+    from protos.model.ids import Address, InterfaceName
 
 MAX_STATES = 256
 """Interfaces whose past is remembered, as many as the data plane has numbers for."""

@@ -29,7 +29,7 @@ from sidecar.core.crypto.aead import KEY_BYTES, choose
 if TYPE_CHECKING:
     from cryptography.hazmat.primitives.asymmetric.x25519 import X25519PrivateKey, X25519PublicKey
 
-    from protos.model import InterfaceId
+    from protos.model.ids import InterfaceId
     from protos.trust.credential import Aead, SessionCredential
 
 _PAIR = b"plr 2 pair"

@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING
 from cryptography.hazmat.primitives.asymmetric.x25519 import X25519PrivateKey, X25519PublicKey
 
 from protos.base.errors import DecodeError
-from protos.model import Candidate, SessionId
+from protos.model.ids import SessionId
+from protos.model.members import Candidate
 from protos.trust.candidate_signature import verify_candidates
 from protos.trust.credential import SessionCredential, decode_credential
 from protos.trust.identity import CertificateError
@@ -17,7 +18,7 @@ from sidecar.core.crypto.key_schedule import pair_keys
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from protos.model import Peer
+    from protos.model.members import Peer
     from sidecar.core.crypto.key_schedule import PairKeys
 
 MAX_ADMITTED = 8192

@@ -12,11 +12,12 @@ from collections import Counter, OrderedDict
 from typing import TYPE_CHECKING, NamedTuple
 
 from protos.base.errors import DecodeError
-from protos.model import MAX_CANDIDATES_OF_INTERFACE
+from protos.model.members import MAX_CANDIDATES_OF_INTERFACE
 from protos.trust.identity import REVOKED, CertificateError
 
 if TYPE_CHECKING:
-    from protos.model import Candidate, InterfaceId, NodeName, Peer
+    from protos.model.ids import InterfaceId, NodeName
+    from protos.model.members import Candidate, Peer
     from sidecar.core.crypto.session import OwnSession
 
 MAX_REMEMBERED = 8192

@@ -11,7 +11,8 @@ from functools import partial
 from typing import TYPE_CHECKING
 
 from protos.base.errors import DecodeError, UnknownKindError
-from protos.model import MAX_PEERS, MappingSet, PeerSet, RemovalReason, Report, Role, ServiceUse
+from protos.model.ids import Role
+from protos.model.members import MAX_PEERS, PeerSet, RemovalReason, ServiceUse
 from sidecar.core.base.report_scope import ReportScope
 from sidecar.core.base.slices import SLICE, Backlog, Step, rest
 from sidecar.core.base.values import ExecutionId, PathId, PathState, RejectReason, RequestId
@@ -66,7 +67,10 @@ from sidecar.core.wire.messages import (
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterable, Iterator, Mapping
 
-    from protos.model import InterfaceName, NodeName, Peer, ServiceMapping, ServiceName, ServiceOffer, SessionId
+    from protos.model.ids import InterfaceName, NodeName, ServiceName, SessionId
+    from protos.model.mapping import MappingSet, ServiceMapping
+    from protos.model.members import Peer, ServiceOffer
+    from protos.model.report import Report
     from sidecar.core.crypto.session import OwnSession
     from sidecar.core.message.decoding import Decoding
     from sidecar.core.rules.budget import Budget

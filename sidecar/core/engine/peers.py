@@ -19,7 +19,8 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from protos.base.errors import DecodeError
-from protos.model import MAX_PEERS, NO_POLICY, POLICY_PENDING, PeerSet, RemovalReason, Version
+from protos.model.ids import Version
+from protos.model.members import MAX_PEERS, NO_POLICY, POLICY_PENDING, PeerSet, RemovalReason
 from protos.trust.identity import CertificateError
 from sidecar.core.engine.announced import Announced
 from sidecar.core.engine.verification_budget import VerificationBudget
@@ -29,7 +30,8 @@ if TYPE_CHECKING:
     from collections import Counter
     from collections.abc import Callable, Iterable
 
-    from protos.model import Address, InterfaceId, NodeName, Peer, ServiceName, SessionId
+    from protos.model.ids import Address, InterfaceId, NodeName, ServiceName, SessionId
+    from protos.model.members import Peer
     from sidecar.core.crypto.key_schedule import PairKeys
     from sidecar.core.crypto.session import OwnSession
     from sidecar.core.seam.links import PeerRenewed, PeerRestarted

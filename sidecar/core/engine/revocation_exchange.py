@@ -22,7 +22,7 @@ from sidecar.core.wire.messages import RevocationLists, RevocationsHeld, Revocat
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
 
-    from protos.model import NodeName
+    from protos.model.ids import NodeName
     from sidecar.core.message.outbound import OutboundMessage
     from sidecar.core.seam.stats import EngineStats
     from sidecar.core.transfer.outbox import Outbox

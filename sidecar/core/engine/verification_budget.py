@@ -15,7 +15,7 @@ from protos.base.token_bucket import TokenBucket
 if TYPE_CHECKING:
     from collections.abc import Container
 
-    from protos.model import NodeName
+    from protos.model.ids import NodeName
 
 LOOKS_PER_S = 10.0
 """For each peer. A hundred forgeries a second hold a restart up for some ten tries, 2.5 s in the median."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, NamedTuple
 
-from protos.model import Role
+from protos.model.ids import Role
 from protos.trust.pair_token import pair_token
 from sidecar.core.base.timers import NEVER
 from sidecar.core.base.values import PathState
@@ -28,7 +28,7 @@ from sidecar.core.wire.frame import (
 from sidecar.core.wire.introduction import INTRODUCTION_BYTES, encode_introduction
 
 if TYPE_CHECKING:
-    from protos.model import Address, InterfaceId, InterfaceName, NodeName, SessionId
+    from protos.model.ids import Address, InterfaceId, InterfaceName, NodeName, SessionId
     from protos.trust.credential import SessionCredential
     from sidecar.core.message.outbound import OutboundMessage
     from sidecar.core.path.path import Path

@@ -51,7 +51,7 @@ if TYPE_CHECKING:
     from collections import deque
     from collections.abc import Callable, Iterable, Iterator
 
-    from protos.model import Address, NodeName
+    from protos.model.ids import Address, NodeName
     from sidecar.core.link.datagrams import LinkIdentity
     from sidecar.core.link.pinging import Pong
     from sidecar.core.message.outbound import OutboundMessage

@@ -12,7 +12,7 @@ from collections import OrderedDict
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from protos.model import InterfaceId, NodeName, SessionId
+    from protos.model.ids import InterfaceId, NodeName, SessionId
     from sidecar.core.path.keys import PathKeys
 
 MAX_PATHS_OF_A_PEER = 256

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from collections import deque
     from collections.abc import Iterable
 
-    from protos.model import Address
+    from protos.model.ids import Address
     from sidecar.core.path.in_flight import Sent
     from sidecar.core.path.path import Path
     from sidecar.core.seam.links import LinkEvent

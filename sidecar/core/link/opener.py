@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 from cryptography.exceptions import InvalidTag
 
 from protos.base.errors import DecodeError
-from protos.model import InterfaceId, SessionId
+from protos.model.ids import InterfaceId, SessionId
 from sidecar.core.base.values import PathState
 from sidecar.core.crypto.aead import TAG_BYTES
 from sidecar.core.link.path_table import MAX_INTRODUCTIONS
@@ -19,7 +19,7 @@ from sidecar.core.wire.frame import CLEAR, HEADER_BYTES, INTRODUCTION_FLAG, MIN_
 from sidecar.core.wire.introduction import UnauthenticError, open_introduction, read_hello_id
 
 if TYPE_CHECKING:
-    from protos.model import Address
+    from protos.model.ids import Address
     from sidecar.core.link.path_table import PathTable
     from sidecar.core.path.path import Path
     from sidecar.core.wire.frame import Header

@@ -6,7 +6,7 @@ from collections import deque
 from typing import TYPE_CHECKING
 
 from protos.base.token_bucket import TokenBucket
-from protos.model import Role
+from protos.model.ids import Role
 from sidecar.core.base.values import PathId, PathState
 from sidecar.core.link.memory import LinkMemory
 from sidecar.core.link.pinging import Pings
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     import random
     from collections.abc import Sequence
 
-    from protos.model import Address, InterfaceId, NodeName, SessionId
+    from protos.model.ids import Address, InterfaceId, NodeName, SessionId
     from sidecar.core.link.datagrams import LinkIdentity
     from sidecar.core.path.key_exchange import KeyLimits
     from sidecar.core.seam.links import LinkEvent, LinkPeer

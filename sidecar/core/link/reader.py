@@ -6,7 +6,7 @@ from itertools import islice
 from typing import TYPE_CHECKING, TypeVar
 
 from protos.base.errors import DecodeError
-from protos.model import Role
+from protos.model.ids import Role
 from sidecar.core.base.values import PathState
 from sidecar.core.crypto.aead import TAG_BYTES
 from sidecar.core.link.opener import LinkOpener
@@ -29,7 +29,7 @@ from sidecar.core.wire.frame import (
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from protos.model import Address
+    from protos.model.ids import Address
     from sidecar.core.link.liveness import PathKeeper
     from sidecar.core.link.mtu import LinkMtu
     from sidecar.core.link.opener import Opened

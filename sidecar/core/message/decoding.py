@@ -16,7 +16,7 @@ from sidecar.core.base.fair_share import Shares
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from protos.model import NodeName, SessionId
+    from protos.model.ids import NodeName, SessionId
     from sidecar.core.base.values import PathId
     from sidecar.core.message.partial import Partial
 

@@ -12,7 +12,7 @@ from sidecar.core.wire.frame import BASE_SYMBOL_BYTES, FRAGMENT_OVERHEAD_BYTES, 
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
-    from protos.model import NodeName
+    from protos.model.ids import NodeName
     from sidecar.core.base.values import PathId, RequestId
     from sidecar.core.wire.messages import Encoded
 

@@ -16,7 +16,7 @@ from sidecar.core.message.partial import Partial
 if TYPE_CHECKING:
     from collections import Counter
 
-    from protos.model import NodeName
+    from protos.model.ids import NodeName
     from sidecar.core.wire.frame import Fragment
 
 MAX_PEER_BYTES = 64 * 1024 * 1024

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from cryptography.utils import Buffer
 
     from protos.base.token_bucket import TokenBucket
-    from protos.model import InterfaceId
+    from protos.model.ids import InterfaceId
     from protos.trust.credential import Aead
     from sidecar.core.crypto.aead import Cipher
     from sidecar.core.crypto.key_schedule import PairKeys

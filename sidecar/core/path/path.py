@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from collections.abc import Collection
 
     from protos.base.token_bucket import TokenBucket
-    from protos.model import Address, InterfaceId, NodeName, SessionId
+    from protos.model.ids import Address, InterfaceId, NodeName, SessionId
     from sidecar.core.path.keys import PathKeys
     from sidecar.core.path.probing import SentPing
     from sidecar.core.wire.frame import KeyAnswer, KeyOffer

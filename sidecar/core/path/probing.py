@@ -15,7 +15,7 @@ from sidecar.core.path.congestion.rtt import LONGEST_ANSWER_S
 if TYPE_CHECKING:
     import random
 
-    from protos.model import Address
+    from protos.model.ids import Address
     from sidecar.core.base.values import PathId
 
 IDLE_PROBE_S = 0.5

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from protos.model import Address
+    from protos.model.ids import Address
     from sidecar.core.base.values import PathId, PathState
     from sidecar.core.path.path import Path
 

@@ -18,8 +18,8 @@ from functools import partial
 from typing import TYPE_CHECKING
 
 from protos.base.histogram import Histogram
-from protos.model import Assignment
-from protos.redundancy_mode import RedundancyMode
+from protos.model.mapping import Assignment
+from protos.model.redundancy_mode import RedundancyMode
 from sidecar.core.base.slices import GROUP, rest
 from sidecar.core.base.timers import first_of
 from sidecar.core.base.values import PathId, PathState, RejectReason, RequestId
@@ -34,7 +34,7 @@ from sidecar.core.wire.messages import MAX_NAME_BYTES, MAX_PAYLOAD_BYTES, Reject
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Iterable, Iterator
 
-    from protos.model import NodeName, ServiceName
+    from protos.model.ids import NodeName, ServiceName
     from sidecar.core.base.slices import Step
     from sidecar.core.message.outbound import OutboundMessage
     from sidecar.core.robot.dispatch.context import RequestParts

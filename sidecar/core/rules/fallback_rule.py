@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from protos.model import ServiceName
+    from protos.model.ids import ServiceName
 
 
 @dataclass(frozen=True, slots=True)

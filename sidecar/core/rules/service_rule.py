@@ -12,14 +12,14 @@ import re
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from protos.preferences import EVERY_INTERFACE, Copies
-from protos.redundancy_mode import DEFAULT_ADAPTIVE_TARGET, DEFAULT_HEDGE_QUANTILE, RedundancyMode
+from protos.model.members import EVERY_INTERFACE, Copies
+from protos.model.redundancy_mode import DEFAULT_ADAPTIVE_TARGET, DEFAULT_HEDGE_QUANTILE, RedundancyMode
 from sidecar.core.base.values import Priority
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
 
-    from protos.model import ServiceName
+    from protos.model.ids import ServiceName
     from sidecar.core.message.repair import Redundancy
     from sidecar.core.rules.fallback_rule import FallbackRule
 

@@ -6,7 +6,8 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from protos.model import Assignment, InterfaceName, NodeName, ServiceName
+    from protos.model.ids import InterfaceName, NodeName, ServiceName
+    from protos.model.mapping import Assignment
     from sidecar.core.base.values import ExecutionId, Priority, RequestId
 
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, NamedTuple
 
 if TYPE_CHECKING:
-    from protos.model import Address, InterfaceId, NodeName, SessionId
+    from protos.model.ids import Address, InterfaceId, NodeName, SessionId
     from protos.trust.credential import SessionCredential
     from sidecar.core.base.values import PathId, PathState
     from sidecar.core.crypto.key_schedule import PairKeys

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from protos.base.histogram import Histogram
-    from protos.model import InterfaceName, NodeName, ServiceName
+    from protos.model.ids import InterfaceName, NodeName, ServiceName
 
 
 @dataclass(slots=True)

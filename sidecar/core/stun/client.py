@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     import random
     from collections.abc import Iterable
 
-    from protos.model import Address
+    from protos.model.ids import Address
     from sidecar.core.stun.events import StunEvent
 
 MAX_SERVERS_PER_FAMILY = 4

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     import random
     from collections import Counter
 
-    from protos.model import Address
+    from protos.model.ids import Address
 
 MAX_QUEUED_EVENTS = 64
 """Events kept for a driver that does not fetch them; the oldest goes first and is counted."""

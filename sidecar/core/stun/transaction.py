@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 from protos.stun.codec import MessageClass, StunMessage, encode
 
 if TYPE_CHECKING:
-    from protos.model import Address
+    from protos.model.ids import Address
 
 
 @dataclass(frozen=True, slots=True)

@@ -13,7 +13,7 @@ from sidecar.core.wire.frame import BASE_SYMBOL_BYTES
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from protos.model import NodeName, SessionId
+    from protos.model.ids import NodeName, SessionId
     from sidecar.core.base.values import PathId
     from sidecar.core.seam.links import PathCommand
     from sidecar.core.seam.stats import EngineStats

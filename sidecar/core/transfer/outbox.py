@@ -16,7 +16,7 @@ from sidecar.core.wire.frame import symbol_count
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from protos.model import InterfaceName, NodeName
+    from protos.model.ids import InterfaceName, NodeName
     from sidecar.core.base.slices import Step
     from sidecar.core.base.values import PathId, Priority, RequestId
     from sidecar.core.message.repair import Redundancy

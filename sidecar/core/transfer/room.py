@@ -14,7 +14,7 @@ from sidecar.core.base.fair_share import Shares
 from sidecar.core.wire.frame import BASE_SYMBOL_BYTES
 
 if TYPE_CHECKING:
-    from protos.model import NodeName
+    from protos.model.ids import NodeName
     from sidecar.core.base.values import PathId
     from sidecar.core.message.outbound import OutboundMessage
 

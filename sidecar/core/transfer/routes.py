@@ -14,7 +14,7 @@ from sidecar.core.wire.frame import BASE_BYTES, FRAGMENT_OVERHEAD_BYTES
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
 
-    from protos.model import InterfaceName, NodeName
+    from protos.model.ids import InterfaceName, NodeName
 
 _order = attrgetter("order")
 _RANK = {PathState.UP: 0, PathState.UNSTABLE: 1, PathState.DOWN: 2}

@@ -51,7 +51,7 @@ import struct
 from typing import TYPE_CHECKING, NamedTuple
 
 from protos.base.errors import DecodeError
-from protos.model import OLDEST_PROTOCOL_VERSION, PROTOCOL_VERSION, InterfaceId, SessionId
+from protos.model.ids import OLDEST_PROTOCOL_VERSION, PROTOCOL_VERSION, InterfaceId, SessionId
 from sidecar.core.crypto.aead import NONCE_BYTES, TAG_BYTES
 
 if TYPE_CHECKING:

@@ -7,7 +7,7 @@ Layout: the 20 clear bytes of every datagram (flags bit 2 set), then::
              credential (protos/trust/credential.py)
     tag (16 bytes)
 
-The token is the sender's for this receiver (`protos/trust/pair_token.py`): stable, and known to these two and the control
+The token is the sender's for this receiver (`protos.trust.pair_token`): stable, and known to these two and the control
 plane alone. It is a gate that costs a stranger's datagram a look into a table. Behind it stands ChaCha20-Poly1305 with
 a key from Expand(token, "plr 2 introduction" | session | sender's interface | receiver's interface | receiver's name),
 the clear bytes and the hello id as associated data, and the nonce of every datagram (frame.py): one key for each path
@@ -46,7 +46,7 @@ from sidecar.core.wire.frame import (
 )
 
 if TYPE_CHECKING:
-    from protos.model import NodeName
+    from protos.model.ids import NodeName
     from protos.trust.credential import SessionCredential
 
 HELLO_BYTES = 8

@@ -26,9 +26,9 @@ from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, NamedTuple
 
 from protos.base.errors import DecodeError, UnknownKindError
-from protos.base.names import clean_text
 from protos.convert.fields import MAX_CRL_BYTES
-from protos.model import ServiceName
+from protos.model.ids import ServiceName
+from protos.model.names import clean_text
 from protos.trust.identity import MAX_CA_CERTIFICATES
 from sidecar.core.base.request_id import REQUEST_ID_BYTES
 from sidecar.core.base.values import Priority, RejectReason, RequestId

@@ -6,7 +6,7 @@ import logging
 import time
 from typing import TYPE_CHECKING
 
-from protos.model import ServiceOffer
+from protos.model.members import ServiceOffer
 from sidecar.core.base.fair_share import Shares
 from sidecar.core.base.values import RejectReason
 from sidecar.core.rules.service_rule import Rules
@@ -22,7 +22,7 @@ from sidecar.ros.types import TypeNotInstalledError, load_service_type
 if TYPE_CHECKING:
     from collections.abc import Generator, Iterator
 
-    from protos.model import ServiceName
+    from protos.model.ids import ServiceName
     from sidecar.core.base.values import ExecutionId
     from sidecar.core.rules.service_rule import ServiceRule
     from sidecar.core.seam.application import ApplicationEvent

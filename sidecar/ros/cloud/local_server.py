@@ -13,7 +13,7 @@ from sidecar.ros.ros_loop import service_qos
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
-    from protos.model import ServiceName
+    from protos.model.ids import ServiceName
     from sidecar.ros.graph.graph import NameOf
     from sidecar.ros.types import ServiceType
 

@@ -13,7 +13,7 @@ from sidecar.ros.errors import RosBridgeError
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from protos.model import NodeName, ServiceName
+    from protos.model.ids import NodeName, ServiceName
     from sidecar.core.base.values import ExecutionId, Priority
     from sidecar.ros.graph.graph import NameOf
     from sidecar.ros.rcl import Message

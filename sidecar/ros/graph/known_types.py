@@ -14,7 +14,7 @@ from sidecar.ros.types import load_service_type
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
-    from protos.model import Peer
+    from protos.model.members import Peer
     from sidecar.core.rules.service_rule import ServiceRule
 
 MAX_LINES = 10

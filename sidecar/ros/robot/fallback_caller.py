@@ -17,7 +17,7 @@ from sidecar.ros.types import load_service_type
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping
 
-    from protos.model import ServiceName
+    from protos.model.ids import ServiceName
     from sidecar.core.base.values import RequestId
     from sidecar.core.robot.fallback.fallbacks import FallbackCall
     from sidecar.core.rules.service_rule import ServiceRule

@@ -14,7 +14,7 @@ from sidecar.ros.types import TypeNotInstalledError, load_service_type
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping
 
-    from protos.model import ServiceName
+    from protos.model.ids import ServiceName
     from sidecar.core.rules.service_rule import ServiceRule
     from sidecar.core.seam.application import OfferService, WithdrawService
     from sidecar.ros.rcl import RmwRequestId

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 from sidecar.core.base.request_id import make_request_id
 
 if TYPE_CHECKING:
-    from protos.model import SessionId
+    from protos.model.ids import SessionId
     from sidecar.core.base.values import RequestId
     from sidecar.ros.rcl import RmwRequestId
 

@@ -30,7 +30,7 @@ from sidecar.ros.robot.request_numbering import RequestNumbering
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from protos.model import ServiceName
+    from protos.model.ids import ServiceName
     from sidecar.core.base.values import RequestId
     from sidecar.core.rules.service_rule import ServiceRule
     from sidecar.core.seam.application import ApplicationEvent

@@ -11,7 +11,7 @@ from sidecar.ros.ros_loop import service_qos
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from protos.model import ServiceName
+    from protos.model.ids import ServiceName
     from sidecar.ros.types import ServiceType
 
 QUEUE_DEPTH = 1024

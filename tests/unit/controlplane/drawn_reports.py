@@ -7,18 +7,16 @@ import random
 from typing import TYPE_CHECKING
 
 from protos.base.histogram import Histogram
-from protos.model import (
-    Assignment,
+from protos.model.ids import InterfaceName, NodeName, ServiceName
+from protos.model.mapping import Assignment
+from protos.model.report import (
     InterfaceJointReport,
-    InterfaceName,
     JointReport,
     LatencyReport,
-    NodeName,
     OutcomeReport,
     PathReport,
     PenaltyReport,
     Report,
-    ServiceName,
 )
 
 if TYPE_CHECKING:

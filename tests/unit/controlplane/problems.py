@@ -23,8 +23,8 @@ from controlplane.core.problem.problem import (
     fleet_excess,
     is_valid,
 )
-from protos.model import InterfaceName, NodeName, ServiceName
-from protos.preferences import AT_MOST_EVERY_INTERFACE, EVERY_INTERFACE, Copies
+from protos.model.ids import InterfaceName, NodeName, ServiceName
+from protos.model.members import AT_MOST_EVERY_INTERFACE, EVERY_INTERFACE, Copies
 
 if TYPE_CHECKING:
     import random

@@ -6,24 +6,26 @@ import zlib
 
 from controlplane.core.registry.registry import StreamId
 from protos.base.histogram import Histogram
-from protos.model import (
+from protos.model.ids import (
     PROTOCOL_VERSION,
-    Candidate,
-    CandidateKind,
     InterfaceId,
     InterfaceName,
-    LatencyReport,
     NodeName,
-    PathReport,
-    Registration,
     Role,
     ServiceName,
-    ServiceOffer,
-    ServiceUse,
     SessionId,
     Version,
 )
-from protos.preferences import EVERY_INTERFACE, Copies
+from protos.model.members import (
+    EVERY_INTERFACE,
+    Candidate,
+    CandidateKind,
+    Copies,
+    Registration,
+    ServiceOffer,
+    ServiceUse,
+)
+from protos.model.report import LatencyReport, PathReport
 
 PLAN = ServiceName("/plan")
 PLAN_TYPE = "nav_msgs/srv/GetPlan"

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from controlplane.observe.fleet_metrics import MAX_GONE, Fleet
-from protos.model import NodeName
+from protos.model.ids import NodeName
 
 if TYPE_CHECKING:
     from collections.abc import Iterable

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from controlplane.serve.earliest_end import EarliestEnd
-from protos.model import NodeName
+from protos.model.ids import NodeName
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

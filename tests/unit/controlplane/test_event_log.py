@@ -16,8 +16,8 @@ from controlplane.observe.event_lines import decode, encode
 from controlplane.observe.event_log import FILE, EventLog
 from controlplane.observe.remembered import departures
 from protos.base.errors import DecodeError
-from protos.fleet_events import EventKind, EventQuery, FleetEvent, Why
-from protos.model import NodeName, Role
+from protos.model.fleet_events import EventKind, EventQuery, FleetEvent, Why
+from protos.model.ids import NodeName, Role
 from protos.program import own_folder
 
 if TYPE_CHECKING:

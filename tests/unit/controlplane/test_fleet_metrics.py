@@ -34,24 +34,13 @@ from controlplane.observe.fleet_metrics import (
 )
 from controlplane.observe.metrics import Metrics
 from protos.base.histogram import Histogram
-from protos.fleet_events import DepartedSidecar, Why
-from protos.model import (
-    Assignment,
-    CandidateSet,
-    Drain,
-    InterfaceName,
-    NodeName,
-    OutcomeReport,
-    PathReport,
-    RemovalReason,
-    Report,
-    Role,
-    ServiceMapping,
-    ServiceName,
-    ServiceSet,
-)
-from protos.preferences import InterfaceLabel
-from protos.redundancy_mode import RedundancyMode
+from protos.model.fleet_events import DepartedSidecar, Why
+from protos.model.ids import InterfaceName, NodeName, Role, ServiceName
+from protos.model.mapping import Assignment, ServiceMapping
+from protos.model.members import CandidateSet, InterfaceLabel, RemovalReason, ServiceSet
+from protos.model.redundancy_mode import RedundancyMode
+from protos.model.report import OutcomeReport, PathReport, Report
+from protos.model.stream import Drain
 from tests.sim.control_world import SETTLED_S, SimSidecar, World
 from tests.unit.controlplane.samples import (
     PLAN,

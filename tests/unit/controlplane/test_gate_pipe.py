@@ -12,7 +12,7 @@ import pytest
 
 from controlplane.ca import Authority
 from controlplane.serve.gate_pipe import PipeEnd
-from protos.model import NodeName
+from protos.model.ids import NodeName
 from protos.trust.identity import IdentityRole
 
 if TYPE_CHECKING:

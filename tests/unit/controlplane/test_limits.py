@@ -13,7 +13,8 @@ from controlplane.serve.stream_limits import (
     StreamRate,
 )
 from protos.convert.reports import report_entries
-from protos.model import NodeName, OutcomeReport, PenaltyReport, Report
+from protos.model.ids import NodeName
+from protos.model.report import OutcomeReport, PenaltyReport, Report
 from tests.unit.controlplane.samples import PLAN
 
 

@@ -6,18 +6,10 @@ import asyncio
 
 from controlplane.core.publish.messages import CloseReason
 from controlplane.serve.mailbox import Mailbox
-from protos.model import (
-    MappingSet,
-    NodeName,
-    Peer,
-    PeerSet,
-    RemovalReason,
-    RemovedPeer,
-    Role,
-    SessionId,
-    Version,
-    Welcome,
-)
+from protos.model.ids import NodeName, Role, SessionId, Version
+from protos.model.mapping import MappingSet
+from protos.model.members import Peer, PeerSet, RemovalReason, RemovedPeer
+from protos.model.stream import Welcome
 
 WELCOME = Welcome(5.0, 0.5)
 

@@ -18,8 +18,8 @@ from controlplane.core.publish.snapshots import VersionSource
 from controlplane.solver import group
 from controlplane.solver.matcher import Matcher
 from protos.convert import use_from_proto, use_to_proto
-from protos.model import MAX_VERSION, InterfaceName, NodeName, ServiceName, Version
-from protos.preferences import Copies
+from protos.model.ids import MAX_VERSION, InterfaceName, NodeName, ServiceName, Version
+from protos.model.members import Copies
 from tests.unit.controlplane.samples import histogram, use
 
 if TYPE_CHECKING:

@@ -8,7 +8,7 @@ import prometheus_client
 
 from controlplane.observe.fleet_metrics import REUSED_S, Fleet
 from controlplane.observe.metrics import Metrics
-from protos.model import OutcomeReport, Report
+from protos.model.report import OutcomeReport, Report
 from tests.sim.control_world import World
 from tests.unit.controlplane.samples import PLAN
 

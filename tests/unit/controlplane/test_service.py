@@ -14,7 +14,10 @@ from controlplane.serve.mailbox import Mailbox
 from controlplane.serve.service import ControlPlaneService
 from controlplane.serve.stream_limits import MAX_FIRST_BYTES
 from protos.convert import sidecar_message_to_proto
-from protos.model import Heartbeat, PeerSet, Report, Version
+from protos.model.ids import Version
+from protos.model.members import PeerSet
+from protos.model.report import Report
+from protos.model.stream import Heartbeat
 from protos.plr.v1 import control_pb2
 from tests.unit.controlplane.samples import registration
 

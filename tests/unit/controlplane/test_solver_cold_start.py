@@ -10,7 +10,7 @@ import pytest
 _STARTS_AND_SOLVES = """
 import sys
 import controlplane.__main__, controlplane.serve.server
-from controlplane.matcher import Matcher
+from controlplane.solver.matcher import Matcher
 from controlplane.core.problem.problem import Problem
 Matcher().solve(Problem(()), time_limit_s=1.0)
 assert "ortools" not in sys.modules and "pandas" not in sys.modules

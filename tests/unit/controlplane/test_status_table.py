@@ -9,22 +9,11 @@ import pytest
 
 from controlplane.cli import status_table
 from controlplane.cli.status_table import MAX_HINTED, MAX_LINE, MAX_LINES, render
-from protos.model import (
-    Assignment,
-    HeldList,
-    InterfaceName,
-    NodeName,
-    PathReport,
-    Peer,
-    RevocationSet,
-    Role,
-    ServiceMapping,
-    ServiceName,
-    ServiceOffer,
-    SessionId,
-    Version,
-)
-from protos.status import ResourceStatus, SidecarStatus, SyncState
+from protos.model.ids import InterfaceName, NodeName, Role, ServiceName, SessionId, Version
+from protos.model.mapping import Assignment, ServiceMapping
+from protos.model.members import HeldList, Peer, RevocationSet, ServiceOffer
+from protos.model.report import PathReport
+from protos.model.status import ResourceStatus, SidecarStatus, SyncState
 from tests.unit.controlplane.samples import PLAN, histogram, offer, use
 
 SYNCED = ResourceStatus(Version(7), Version(7), SyncState.SYNCED)

@@ -10,18 +10,8 @@ from controlplane.core.publish.told_peers import ToldPeers
 from controlplane.serve import stream_encoder
 from controlplane.serve.stream_encoder import StreamEncoder
 from protos.convert import parse_control_message
-from protos.model import (
-    NodeName,
-    Peer,
-    PeerSet,
-    RemovalReason,
-    RemovedPeer,
-    Role,
-    ServiceName,
-    ServiceOffer,
-    SessionId,
-    Version,
-)
+from protos.model.ids import NodeName, Role, ServiceName, SessionId, Version
+from protos.model.members import Peer, PeerSet, RemovalReason, RemovedPeer, ServiceOffer
 from tests.unit.protos.message_strategies import control_messages, peers
 
 ENCODER = StreamEncoder()

@@ -13,7 +13,7 @@ from protos.base.size_class import SIZE_CLASSES
 from protos.convert.control import MAX_WALL_S
 from protos.convert.fields import MAX_CAPACITY, MAX_CHARGE, MAX_COPIES, MAX_DURATION_S, MAX_EVENTS
 from protos.convert.types import LEAST_TARGET
-from protos.explanation import (
+from protos.model.explanation import (
     Alternative,
     AlternativeKind,
     Belief,
@@ -23,58 +23,54 @@ from protos.explanation import (
     MappingChange,
     PairExplanation,
 )
-from protos.fleet_events import DepartedSidecar, EventKind, EventLogState, FleetEvent, Why
-from protos.model import (
+from protos.model.fleet_events import DepartedSidecar, EventKind, EventLogState, FleetEvent, Why
+from protos.model.ids import (
+    MAX_VERSION,
+    PROTOCOL_VERSION,
+    Address,
+    InterfaceId,
+    InterfaceName,
+    NodeName,
+    Role,
+    ServiceName,
+    SessionId,
+    Version,
+)
+from protos.model.mapping import Assignment, MappingSet, ServiceMapping
+from protos.model.members import (
     ALL_CALLS,
     MAX_CREDENTIAL_BYTES,
     MAX_SIGNATURE_BYTES,
-    MAX_VERSION,
-    PROTOCOL_VERSION,
     TOKEN_BYTES,
-    Ack,
-    Address,
-    Assignment,
     CallPermit,
     Candidate,
     CandidateKind,
     CandidateSet,
-    ControlMessage,
-    Drain,
-    Heartbeat,
+    Copies,
     HeldList,
-    InterfaceId,
-    InterfaceJointReport,
-    InterfaceName,
-    JointReport,
-    LatencyReport,
-    MappingSet,
-    Nack,
-    NodeName,
-    OutcomeReport,
-    PathReport,
+    InterfaceLabel,
     Peer,
     PeerSet,
-    PenaltyReport,
     Registration,
     RemovalReason,
     RemovedPeer,
-    Report,
-    ResourceKind,
     RevocationSet,
-    Role,
-    ServiceMapping,
-    ServiceName,
     ServiceOffer,
     ServiceSet,
     ServiceUse,
-    SessionId,
-    SidecarMessage,
-    Version,
-    Welcome,
 )
-from protos.preferences import Copies, InterfaceLabel
-from protos.redundancy_mode import RedundancyMode
-from protos.status import ResourceStatus, SidecarStatus, SyncState
+from protos.model.redundancy_mode import RedundancyMode
+from protos.model.report import (
+    InterfaceJointReport,
+    JointReport,
+    LatencyReport,
+    OutcomeReport,
+    PathReport,
+    PenaltyReport,
+    Report,
+)
+from protos.model.status import ResourceStatus, SidecarStatus, SyncState
+from protos.model.stream import Ack, ControlMessage, Drain, Heartbeat, Nack, ResourceKind, SidecarMessage, Welcome
 
 T = TypeVar("T")
 

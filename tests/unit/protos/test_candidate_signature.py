@@ -9,7 +9,8 @@ from hypothesis import strategies as st
 
 from controlplane.ca import Authority
 from protos.base.errors import DecodeError
-from protos.model import MAX_SIGNATURE_BYTES, Candidate, CandidateKind, InterfaceId, InterfaceName, SessionId
+from protos.model.ids import InterfaceId, InterfaceName, SessionId
+from protos.model.members import MAX_SIGNATURE_BYTES, Candidate, CandidateKind
 from protos.trust.candidate_signature import sign_candidates, signed_bytes, verify_candidates
 from protos.trust.identity import CertificateError, IdentityRole
 from tests.unit.protos import message_strategies as some

@@ -13,8 +13,8 @@ from controlplane.ca import Authority
 from controlplane.ca.authority import AuthorityError
 from controlplane.ca.certificates import Validity
 from protos.program import tls_advice
+from protos.program.certificate_term import SOON_S, term_problem
 from protos.program.tls_files import load_tls_files
-from protos.trust.certificate_term import SOON_S, term_problem
 from protos.trust.identity import IdentityRole
 from sidecar.__main__ import main as sidecar
 

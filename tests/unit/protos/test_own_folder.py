@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 import pytest
 
 from controlplane.observe.event_log import EventLog
-from protos.fleet_events import EventKind
-from protos.model import NodeName
+from protos.model.fleet_events import EventKind
+from protos.model.ids import NodeName
 from protos.program.own_folder import OwnFolder
 from sidecar.state.store import StateDirError, StateStore
 

@@ -6,7 +6,8 @@ import pytest
 from cryptography.hazmat.primitives.hashes import SHA256
 from cryptography.hazmat.primitives.kdf.hkdf import HKDFExpand
 
-from protos.model import TOKEN_BYTES, NodeName, Role
+from protos.model.ids import NodeName, Role
+from protos.model.members import TOKEN_BYTES
 from protos.trust.pair_token import pair_token
 
 TOKEN, ROBOT = bytes(range(16)), NodeName("robot-1")

@@ -13,7 +13,7 @@ from cryptography.hazmat.primitives.serialization import BestAvailableEncryption
 from controlplane.ca import Authority
 from controlplane.ca.files import write_tls_files
 from protos.base.errors import ConfigError
-from protos.model import NodeName
+from protos.model.ids import NodeName
 from protos.program.tls_files import MAX_FILE_BYTES, RefusedFiles, TlsWatch, load_tls_files
 from protos.trust.identity import CertificateError, IdentityRole
 

@@ -8,8 +8,8 @@ import pytest
 
 from controlplane.ca import Authority
 from protos.convert import parse_sidecar_message, sidecar_message_to_proto
-from protos.model import Candidate, CandidateKind, CandidateSet, InterfaceId, InterfaceName, SessionId
-from protos.preferences import InterfaceLabel
+from protos.model.ids import InterfaceId, InterfaceName, SessionId
+from protos.model.members import Candidate, CandidateKind, CandidateSet, InterfaceLabel
 from protos.program.tls_files import load_tls_files
 from protos.trust.candidate_signature import verify_candidates
 from protos.trust.identity import IdentityRole

@@ -9,7 +9,7 @@ import yaml
 from pydantic import ValidationError
 
 from protos.base.errors import ConfigError
-from protos.model import InterfaceName, NodeName, Role
+from protos.model.ids import InterfaceName, NodeName, Role
 from protos.trust.identity import Identity, IdentityRole
 from sidecar.config.sidecar import (
     DEFAULT_CLOUD_UDP_PORT,

@@ -4,9 +4,9 @@ from typing import Any
 
 import pytest
 
-from protos.model import InterfaceName, ServiceName
-from protos.preferences import AT_MOST_EVERY_INTERFACE, EVERY_INTERFACE, Copies, InterfaceLabel
-from protos.redundancy_mode import RedundancyMode
+from protos.model.ids import InterfaceName, ServiceName
+from protos.model.members import AT_MOST_EVERY_INTERFACE, EVERY_INTERFACE, Copies, InterfaceLabel
+from protos.model.redundancy_mode import RedundancyMode
 from sidecar.core.base.values import Priority
 from sidecar.core.rules.budget import Budget
 from sidecar.core.rules.fallback_rule import FallbackRule

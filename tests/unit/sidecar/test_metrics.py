@@ -11,7 +11,8 @@ from prometheus_client import CollectorRegistry, generate_latest
 from prometheus_client.parser import text_string_to_metric_families
 
 from protos.base.histogram import Histogram
-from protos.model import InterfaceName, NodeName, ResourceKind, ServiceName
+from protos.model.ids import InterfaceName, NodeName, ServiceName
+from protos.model.stream import ResourceKind
 from sidecar.core.control.session import ControlStats
 from sidecar.core.seam.stats import EngineStats, LinkStats, PathStats
 from sidecar.observe.metric_families import DURATION_BOUNDS_S, cumulative

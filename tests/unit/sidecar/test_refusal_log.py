@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 from typing import TYPE_CHECKING
 
-from protos.model import ResourceKind
+from protos.model.stream import ResourceKind
 from sidecar.control.refusal_log import RefusalLog
 
 if TYPE_CHECKING:

@@ -12,7 +12,8 @@ from cryptography.hazmat.primitives.asymmetric import ec
 from controlplane.ca import Authority
 from controlplane.ca.files import write_tls_files
 from protos.base.errors import ConfigError, DecodeError
-from protos.model import Peer, Role, SessionId
+from protos.model.ids import Role, SessionId
+from protos.model.members import Peer
 from protos.program.tls_files import TlsFiles, load_tls_files
 from protos.trust.clock_floor import ClockFloor
 from protos.trust.credential import SessionCredential, verify

@@ -13,24 +13,10 @@ from typing import IO, TYPE_CHECKING
 import pytest
 
 from protos.base.errors import DecodeError
-from protos.model import (
-    Assignment,
-    Candidate,
-    CandidateKind,
-    InterfaceId,
-    InterfaceName,
-    MappingSet,
-    NodeName,
-    Peer,
-    PeerSet,
-    Role,
-    ServiceMapping,
-    ServiceName,
-    ServiceOffer,
-    SessionId,
-    Version,
-    Welcome,
-)
+from protos.model.ids import InterfaceId, InterfaceName, NodeName, Role, ServiceName, SessionId, Version
+from protos.model.mapping import Assignment, MappingSet, ServiceMapping
+from protos.model.members import Candidate, CandidateKind, Peer, PeerSet, ServiceOffer
+from protos.model.stream import Welcome
 from protos.program import own_folder
 from sidecar.state import store as state_store
 from sidecar.state.file import (
@@ -326,7 +312,8 @@ WRITE_FOR_EVER = """
 import itertools, sys
 from pathlib import Path
 import sidecar.state.store as state_store
-from protos.model import MappingSet, NodeName, Version
+from protos.model.ids import NodeName, Version
+from protos.model.mapping import MappingSet
 state_store.MIN_WRITE_INTERVAL_S = 0.0
 store = state_store.StateStore(Path(sys.argv[1]), NodeName("robot-1"))
 busy = False
@@ -376,8 +363,9 @@ def test_a_card_gone_read_only_still_yields_the_last_mapping(tmp_path: Path) -> 
 OPEN_AND_REMEMBER = """
 import sys
 from pathlib import Path
-from protos.model import NodeName, Version, MappingSet
-from sidecar.state_store import StateStore
+from protos.model.ids import NodeName, Version
+from protos.model.mapping import MappingSet
+from sidecar.state.store import StateStore
 store = StateStore(Path(sys.argv[1]), NodeName("robot-1"))
 sys.stdout.write(str(store.last_good.mapping and store.last_good.mapping.version) + " ")
 store.remember(MappingSet(Version(int(sys.argv[2])), 0))

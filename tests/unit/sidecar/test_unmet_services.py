@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from protos.model import ServiceName
+from protos.model.ids import ServiceName
 from sidecar.observe.unmet_services import (
     GRACE_S,
     MAX_NAMES_SHOWN,

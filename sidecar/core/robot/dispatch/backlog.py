@@ -15,7 +15,7 @@ from sidecar.core.transfer.waiting_line import WaitingLine
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
 
-    from protos.model import NodeName
+    from protos.model.ids import NodeName
     from sidecar.core.base.values import RequestId
     from sidecar.core.robot.dispatch.dispatcher import Dispatching
     from sidecar.core.robot.request.request import Request

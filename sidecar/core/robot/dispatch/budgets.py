@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
-    from protos.model import InterfaceName, ServiceName
+    from protos.model.ids import InterfaceName, ServiceName
     from sidecar.core.rules.budget import Budget
     from sidecar.core.seam.stats import EngineStats
 

@@ -10,7 +10,7 @@ from sidecar.core.robot.request.request import CopyState
 from sidecar.core.wire.messages import CancelMessage, encode_message
 
 if TYPE_CHECKING:
-    from protos.model import NodeName
+    from protos.model.ids import NodeName
     from sidecar.core.base.values import RequestId
     from sidecar.core.robot.request.request import Copy, Request
     from sidecar.core.seam.stats import EngineStats

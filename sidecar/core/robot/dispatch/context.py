@@ -12,7 +12,7 @@ from sidecar.core.robot.request.index import RequestIndex
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from protos.model import NodeName
+    from protos.model.ids import NodeName
     from sidecar.core.robot.measure.measurements import Measurements
     from sidecar.core.robot.request.mapping_table import MappingTable
     from sidecar.core.robot.request.service_catalog import Offers

@@ -9,7 +9,7 @@ from __future__ import annotations
 import enum
 from typing import TYPE_CHECKING
 
-from protos.redundancy_mode import RedundancyMode
+from protos.model.redundancy_mode import RedundancyMode
 from sidecar.core.base.values import PathState
 from sidecar.core.robot.dispatch.adaptive import Adaptive
 from sidecar.core.robot.dispatch.budgets import Budgets
@@ -22,7 +22,7 @@ from sidecar.core.wire.messages import RequestMessage, encode_message
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterable
 
-    from protos.model import NodeName
+    from protos.model.ids import NodeName
     from sidecar.core.base.values import PathId
     from sidecar.core.robot.dispatch.context import RequestParts
     from sidecar.core.wire.messages import Encoded

@@ -16,7 +16,7 @@ from sidecar.core.base.values import PathState
 if TYPE_CHECKING:
     from collections.abc import Collection
 
-    from protos.model import NodeName, ServiceName
+    from protos.model.ids import NodeName, ServiceName
     from sidecar.core.base.values import PathId
     from sidecar.core.robot.request.mapping_table import MappingTable
     from sidecar.core.robot.request.request import Request

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, NamedTuple
 
 if TYPE_CHECKING:
-    from protos.model import InterfaceName, NodeName, ServiceName
+    from protos.model.ids import InterfaceName, NodeName, ServiceName
     from sidecar.core.base.values import PathId
     from sidecar.core.seam.stats import EngineStats
     from sidecar.core.transfer.routes import Routes

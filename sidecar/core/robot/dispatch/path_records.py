@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, NamedTuple
 from sidecar.core.robot.request.request import CopyState
 
 if TYPE_CHECKING:
-    from protos.model import InterfaceName, NodeName, ServiceName
+    from protos.model.ids import InterfaceName, NodeName, ServiceName
     from sidecar.core.base.values import PathId
     from sidecar.core.robot.request.request import Copy, Request
     from sidecar.core.seam.stats import EngineStats

@@ -11,12 +11,12 @@ import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from protos.model import PenaltyReport
+from protos.model.report import PenaltyReport
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
-    from protos.model import NodeName
+    from protos.model.ids import NodeName
 
 FIRST_S = 10.0
 """After the first bad answer it is out of favour for so long, ..."""

@@ -12,7 +12,7 @@ from __future__ import annotations
 import heapq
 from typing import TYPE_CHECKING, NamedTuple
 
-from protos.model import ServiceName
+from protos.model.ids import ServiceName
 from sidecar.core.robot.fallback.queue import FallbackQueue, FallbackRequest
 
 if TYPE_CHECKING:

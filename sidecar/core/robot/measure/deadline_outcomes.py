@@ -13,12 +13,12 @@ from __future__ import annotations
 from itertools import combinations
 from typing import TYPE_CHECKING
 
-from protos.model import Assignment
+from protos.model.mapping import Assignment
 from sidecar.core.robot.measure.interface_outcomes import interface_outcomes
 from sidecar.core.robot.request.request import CopyState
 
 if TYPE_CHECKING:
-    from protos.model import InterfaceName, NodeName
+    from protos.model.ids import InterfaceName, NodeName
     from sidecar.core.robot.measure.measurements import Measurements
     from sidecar.core.robot.request.request import Copy, Request
 

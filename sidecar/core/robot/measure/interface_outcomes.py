@@ -14,14 +14,14 @@ from dataclasses import dataclass
 from itertools import combinations
 from typing import TYPE_CHECKING
 
-from protos.model import InterfaceJointReport
-from protos.redundancy_mode import RedundancyMode
+from protos.model.redundancy_mode import RedundancyMode
+from protos.model.report import InterfaceJointReport
 from sidecar.core.robot.request.request import CopyState
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from protos.model import InterfaceName, NodeName, ServiceName
+    from protos.model.ids import InterfaceName, NodeName, ServiceName
     from sidecar.core.robot.request.request import Request
 
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from protos.base.histogram import Histogram
 from protos.base.size_class import size_class
-from protos.model import (
+from protos.model.report import (
     MAX_JOINTS,
     MAX_LATENCIES,
     MAX_PATHS,
@@ -23,7 +23,8 @@ from sidecar.core.base.values import PathState
 from sidecar.core.robot.measure.interface_outcomes import JointCounts
 
 if TYPE_CHECKING:
-    from protos.model import Assignment, InterfaceName, NodeName, ServiceName
+    from protos.model.ids import InterfaceName, NodeName, ServiceName
+    from protos.model.mapping import Assignment
     from sidecar.core.base.values import PathId
     from sidecar.core.robot.measure.interface_outcomes import InterfacePair, PairOutcome
     from sidecar.core.robot.request.request import Carried

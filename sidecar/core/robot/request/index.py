@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, TypeVar
 
 if TYPE_CHECKING:
-    from protos.model import NodeName, ServiceName
+    from protos.model.ids import NodeName, ServiceName
     from sidecar.core.base.values import PathId, RequestId
     from sidecar.core.robot.request.request import Copy, Request
 

@@ -9,13 +9,14 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from protos.model import MappingSet, ServiceMapping, Version
+from protos.model.ids import Version
 from sidecar.core.base.values import PathState
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Mapping
 
-    from protos.model import InterfaceName, NodeName, ServiceName
+    from protos.model.ids import InterfaceName, NodeName, ServiceName
+    from protos.model.mapping import MappingSet, ServiceMapping
     from sidecar.core.base.values import PathId
     from sidecar.core.transfer.routes import Route, Routes
 

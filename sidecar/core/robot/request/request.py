@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, NamedTuple
 from sidecar.core.base.request_id import is_race
 
 if TYPE_CHECKING:
-    from protos.model import InterfaceName, NodeName, ServiceName
+    from protos.model.ids import InterfaceName, NodeName, ServiceName
     from sidecar.core.base.values import PathId, RequestId
     from sidecar.core.message.outbound import OutboundMessage
     from sidecar.core.rules.service_rule import ServiceRule

@@ -11,14 +11,15 @@ from __future__ import annotations
 from collections import OrderedDict
 from typing import TYPE_CHECKING
 
-from protos.model import ServiceUse
+from protos.model.members import ServiceUse
 from sidecar.core.base.fair_share import Shares
 from sidecar.core.seam.application import OfferService, WithdrawService
 
 if TYPE_CHECKING:
     from collections.abc import Container, Mapping
 
-    from protos.model import NodeName, Peer, ServiceName
+    from protos.model.ids import NodeName, ServiceName
+    from protos.model.members import Peer
     from sidecar.core.rules.service_rule import Rules
     from sidecar.core.seam.stats import EngineStats
     from sidecar.core.transfer.routes import Routes

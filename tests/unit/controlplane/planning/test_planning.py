@@ -20,9 +20,10 @@ from controlplane.planning.traces import COLUMNS, RecordedPaths, parse_trace
 from controlplane.planning.workload import Compute, Workload
 from protos.base.histogram import Histogram
 from protos.convert import explanation_to_proto
-from protos.explanation import SAMPLE, Belief, Correlation, Explanation, JointExplanation, PairExplanation
-from protos.model import Assignment, InterfaceName, NodeName, ServiceName
-from protos.status import ResourceStatus
+from protos.model.explanation import SAMPLE, Belief, Correlation, Explanation, JointExplanation, PairExplanation
+from protos.model.ids import InterfaceName, NodeName, ServiceName
+from protos.model.mapping import Assignment
+from protos.model.status import ResourceStatus
 from tests.unit.controlplane.samples import histogram
 
 if TYPE_CHECKING:

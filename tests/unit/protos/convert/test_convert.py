@@ -11,7 +11,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from protos.base.errors import DecodeError, UnknownKindError
-from protos.base.names import MAX_STRING_BYTES, clean_text
 from protos.convert import (
     control_message_from_proto,
     control_message_to_proto,
@@ -32,41 +31,32 @@ from protos.convert import (
     status_to_proto,
 )
 from protos.convert.fields import MAX_CANDIDATES, MAX_OFFERS
-from protos.fleet_events import EventList
-from protos.model import (
+from protos.model.fleet_events import EventList
+from protos.model.ids import MAX_VERSION, InterfaceId, InterfaceName, NodeName, Role, SessionId, Version
+from protos.model.members import (
     ALL_CALLS,
     MAX_CREDENTIAL_BYTES,
-    MAX_VERSION,
     NO_CALLS,
-    Ack,
     CallPermit,
     Candidate,
     CandidateKind,
     CandidateSet,
-    ControlMessage,
-    InterfaceId,
-    InterfaceName,
-    Nack,
-    NodeName,
     Peer,
     PeerSet,
     RemovalReason,
-    ResourceKind,
     RevocationSet,
-    Role,
     ServiceSet,
-    SessionId,
-    SidecarMessage,
-    Version,
 )
+from protos.model.names import MAX_STRING_BYTES, clean_text
+from protos.model.redundancy_mode import DEFAULT_HEDGE_QUANTILE, RedundancyMode
+from protos.model.status import SidecarStatus
+from protos.model.stream import Ack, ControlMessage, Nack, ResourceKind, SidecarMessage
 from protos.plr.v1 import admin_pb2, control_pb2, types_pb2
-from protos.redundancy_mode import DEFAULT_HEDGE_QUANTILE, RedundancyMode
-from protos.status import SidecarStatus
 from tests.unit.protos import message_strategies as some
 
 if TYPE_CHECKING:
-    from protos.explanation import Explanation
-    from protos.fleet_events import DepartedSidecar, EventLogState, FleetEvent
+    from protos.model.explanation import Explanation
+    from protos.model.fleet_events import DepartedSidecar, EventLogState, FleetEvent
 
 PEERS = control_pb2.RESOURCE_KIND_PEERS
 LEFT = control_pb2.REMOVAL_REASON_LEFT

@@ -12,7 +12,8 @@ from protos.base.errors import DecodeError, UnknownKindError
 from protos.base.histogram import BUCKETS
 from protos.convert import message_cost, parse_sidecar_message, sidecar_message_to_proto
 from protos.convert.message_cost import CHEAP_BYTES, SPARE_FIELDS, check_cost
-from protos.model import MAX_LATENCIES, MAX_PATHS, Heartbeat, Report, SidecarMessage
+from protos.model.report import MAX_LATENCIES, MAX_PATHS, Report
+from protos.model.stream import Heartbeat, SidecarMessage
 from protos.plr.v1 import control_pb2, types_pb2
 from tests.unit.controlplane.samples import histogram, latency, path
 from tests.unit.protos.message_strategies import sidecar_messages

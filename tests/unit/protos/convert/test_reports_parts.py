@@ -8,15 +8,9 @@ from controlplane.core.estimate.estimator import Estimator
 from protos.base.errors import DecodeError
 from protos.convert import parse_in_parts, parse_sidecar_message, sidecar_message_to_proto
 from protos.convert.reports import PART_ENTRIES
-from protos.model import (
-    MAX_PATHS,
-    Heartbeat,
-    InterfaceName,
-    NodeName,
-    PenaltyReport,
-    Report,
-    ServiceName,
-)
+from protos.model.ids import InterfaceName, NodeName, ServiceName
+from protos.model.report import MAX_PATHS, PenaltyReport, Report
+from protos.model.stream import Heartbeat
 from protos.plr.v1 import control_pb2
 from tests.unit.controlplane.samples import histogram, latency, path
 

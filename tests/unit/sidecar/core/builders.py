@@ -6,20 +6,8 @@ import random
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
-from protos.model import (
-    ALL_CALLS,
-    Address,
-    Candidate,
-    CandidateKind,
-    InterfaceId,
-    InterfaceName,
-    NodeName,
-    Peer,
-    Role,
-    ServiceName,
-    ServiceOffer,
-    SessionId,
-)
+from protos.model.ids import Address, InterfaceId, InterfaceName, NodeName, Role, ServiceName, SessionId
+from protos.model.members import ALL_CALLS, Candidate, CandidateKind, Peer, ServiceOffer
 from protos.trust.pair_token import pair_token
 from sidecar.core.base.values import PathId, Priority, RequestId
 from sidecar.core.crypto.aead import TAG_BYTES

@@ -21,7 +21,7 @@ from sidecar.core.wire.messages import CancelMessage, RejectionMessage, Response
 from tests.unit.sidecar.core.builders import ECHO, TYPE, WLAN, WWAN, A, B, path, peer, request_id
 
 if TYPE_CHECKING:
-    from protos.model import NodeName
+    from protos.model.ids import NodeName
     from sidecar.core.rules.budget import Budget
 
 WLAN_A, WWAN_B = path(WLAN, A), path(WWAN, B)

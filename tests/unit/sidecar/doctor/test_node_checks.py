@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from controlplane.ca import Authority
-from protos.model import InterfaceName
+from protos.model.ids import InterfaceName
 from protos.program.tls_files import load_tls_files
 from protos.trust.identity import IdentityRole
 from sidecar.doctor import node_checks

@@ -10,7 +10,7 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from protos.model import InterfaceId, InterfaceName, NodeName
+from protos.model.ids import InterfaceId, InterfaceName, NodeName
 from sidecar.core.base.values import PathId
 from sidecar.core.link.pinging import Pong
 

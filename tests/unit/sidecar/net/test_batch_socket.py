@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from protos.model import InterfaceName
+from protos.model.ids import InterfaceName
 from sidecar.core.link.datagrams import Batch
 from sidecar.core.seam.stats import LinkStats
 from sidecar.net.batch_socket import ARENA_BYTES, RECEIVE_CALLS, ROOM_BYTES, BatchSocket
@@ -18,7 +18,7 @@ from sidecar.net.batch_socket import ARENA_BYTES, RECEIVE_CALLS, ROOM_BYTES, Bat
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from protos.model import Address
+    from protos.model.ids import Address
 
 PATIENCE_S = 20.0
 SEGMENT = 1200

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from protos.model import InterfaceName
+from protos.model.ids import InterfaceName
 from sidecar.core.base.values import PathState
 from sidecar.core.control import ways
 from sidecar.core.control.session import ControlStats
@@ -25,7 +25,7 @@ from sidecar.net.control_dialer import ControlDialer
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable, Coroutine
 
-    from protos.model import Address
+    from protos.model.ids import Address
     from sidecar.net.control_dialer import ControlLine
 
 WAIT_S = 20.0

@@ -17,22 +17,8 @@ from typing import TYPE_CHECKING
 import pytest
 
 from protos.base.errors import DecodeError
-from protos.model import (
-    ALL_CALLS,
-    MAX_PEERS,
-    Candidate,
-    CandidateKind,
-    InterfaceId,
-    InterfaceName,
-    NodeName,
-    Peer,
-    PeerSet,
-    Role,
-    ServiceName,
-    ServiceOffer,
-    SessionId,
-    Version,
-)
+from protos.model.ids import InterfaceId, InterfaceName, NodeName, Role, ServiceName, SessionId, Version
+from protos.model.members import ALL_CALLS, MAX_PEERS, Candidate, CandidateKind, Peer, PeerSet, ServiceOffer
 from protos.trust.identity import NOT_YET_VALID, UNTRUSTED, CertificateError
 from protos.trust.pair_token import pair_token
 from sidecar.core.base.values import PathState, RequestId

@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from protos.model import InterfaceName, PeerSet, Role, ServiceOffer, SessionId, Version
+from protos.model.ids import InterfaceName, Role, SessionId, Version
+from protos.model.members import PeerSet, ServiceOffer
 from sidecar.core.base.values import Priority
 from sidecar.core.engine.engine import EngineConfig
 from sidecar.core.message.decoding import Decoding

@@ -14,7 +14,7 @@ from sidecar.net.host_names import HostNames
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from protos.model import Address
+    from protos.model.ids import Address
 
 TIMEOUT_S = 30.0
 

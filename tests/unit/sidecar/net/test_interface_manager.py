@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from protos.model import InterfaceName, Role
+from protos.model.ids import InterfaceName, Role
 from sidecar.config.service import ServiceConfig
 from sidecar.config.sidecar import SidecarConfig, StunConfig
 from sidecar.core.interfaces.scan_schedule import RETRY_S
@@ -21,7 +21,7 @@ from tests.sessions import session_of
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from protos.model import Candidate
+    from protos.model.members import Candidate
     from sidecar.net.interface_thread import InterfaceThread
 
 LO = Interface(InterfaceName("lo"), 1, "", up=True, carrier=True, mtu=65536, addresses=("127.0.0.1",))

@@ -6,7 +6,7 @@ import threading
 import time
 from typing import TYPE_CHECKING, Any
 
-from protos.model import InterfaceId, InterfaceName, Role
+from protos.model.ids import InterfaceId, InterfaceName, Role
 from sidecar.core.link.datagrams import Batch, LinkIdentity
 from sidecar.core.link.link import Link
 from sidecar.net.interface_thread import InterfaceThread

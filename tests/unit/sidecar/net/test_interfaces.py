@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import pytest
 
-from protos.model import InterfaceName
+from protos.model.ids import InterfaceName
 from sidecar.core.seam.links import Rebind
 from sidecar.net.interfaces import LOOPBACK, Interface, SkippedInterface, choose, list_interfaces, missing_interfaces
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 from typing import TYPE_CHECKING
 
-from protos.model import InterfaceId, InterfaceName, NodeName
+from protos.model.ids import InterfaceId, InterfaceName, NodeName
 from sidecar.core.base.values import PathId, PathState
 from sidecar.core.seam.links import PathChanged
 from sidecar.net.path_log import PathLog

@@ -6,7 +6,7 @@ import time
 
 import pytest
 
-from protos.model import InterfaceId, InterfaceName, NodeName, Role
+from protos.model.ids import InterfaceId, InterfaceName, NodeName, Role
 from sidecar.core.base.values import PathId, PathState
 from sidecar.core.link.datagrams import LinkIdentity
 from sidecar.core.link.link import Link

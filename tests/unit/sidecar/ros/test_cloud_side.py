@@ -8,7 +8,7 @@ from unittest.mock import Mock
 
 import pytest
 
-from protos.model import NodeName
+from protos.model.ids import NodeName
 from sidecar.core.base.fair_share import Shares
 from sidecar.core.base.values import ExecutionId, Priority
 from sidecar.core.seam.application import AbandonExecution

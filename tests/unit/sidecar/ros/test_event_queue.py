@@ -4,7 +4,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from protos.model import NodeName, ServiceName
+from protos.model.ids import NodeName, ServiceName
 from sidecar.core.base.values import ExecutionId, Priority
 from sidecar.core.seam.application import AbandonExecution, CancelExecution, ExecuteRequest, WithdrawService
 from sidecar.ros.event_queue import EventQueue

@@ -7,15 +7,11 @@ from typing import TYPE_CHECKING
 import pytest
 
 from controlplane.core.publish.publisher import INFORM_S
-from protos.model import (
-    Heartbeat,
-    NodeName,
-    OutcomeReport,
-    Report,
-    ServiceSet,
-    Version,
-)
-from protos.status import SyncState
+from protos.model.ids import NodeName, Version
+from protos.model.members import ServiceSet
+from protos.model.report import OutcomeReport, Report
+from protos.model.status import SyncState
+from protos.model.stream import Heartbeat
 from tests.sim.control_world import SETTLED_S
 from tests.unit.controlplane.samples import PLAN, histogram, interfaces, latency, offer, path, use
 

@@ -7,8 +7,10 @@ from typing import TYPE_CHECKING
 import pytest
 
 from controlplane.core.publish.publisher import RESEND_S
-from protos.model import Ack, MappingSet, PeerSet, RemovalReason, ResourceKind
-from protos.status import SyncState
+from protos.model.mapping import MappingSet
+from protos.model.members import PeerSet, RemovalReason
+from protos.model.status import SyncState
+from protos.model.stream import Ack, ResourceKind
 from tests.sim.control_world import SETTLED_S
 
 if TYPE_CHECKING:

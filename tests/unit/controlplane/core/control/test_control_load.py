@@ -11,7 +11,9 @@ from controlplane.core.control import control
 from controlplane.core.estimate.estimator import Estimator
 from controlplane.core.formulation import problem_builder
 from controlplane.core.publish.publisher import INFORM_S
-from protos.model import Heartbeat, MappingSet, PeerSet
+from protos.model.mapping import MappingSet
+from protos.model.members import PeerSet
+from protos.model.stream import Heartbeat
 from tests.sim.control_world import SETTLED_S
 from tests.unit.controlplane.samples import path
 

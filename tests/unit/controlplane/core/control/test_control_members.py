@@ -10,15 +10,10 @@ from controlplane.core.control import control
 from controlplane.core.publish.messages import CloseReason
 from controlplane.core.registry.registry import Refusal
 from protos.base.errors import DecodeError
-from protos.model import (
-    CandidateSet,
-    Drain,
-    NodeName,
-    RemovalReason,
-    Role,
-    ServiceSet,
-)
-from protos.status import SyncState
+from protos.model.ids import NodeName, Role
+from protos.model.members import CandidateSet, RemovalReason, ServiceSet
+from protos.model.status import SyncState
+from protos.model.stream import Drain
 from tests.sim.control_world import SETTLED_S, World
 from tests.unit.controlplane.samples import interfaces, offer, registration
 

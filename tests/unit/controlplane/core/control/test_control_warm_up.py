@@ -7,7 +7,9 @@ import pytest
 from controlplane.core.control.events import Settings
 from protos.convert import parse_in_parts, sidecar_message_to_proto
 from protos.convert.reports import PART_ENTRIES
-from protos.model import CandidateSet, NodeName, Report, Role, ServiceSet
+from protos.model.ids import NodeName, Role
+from protos.model.members import CandidateSet, ServiceSet
+from protos.model.report import Report
 from tests.sim.control_world import SimSidecar, World
 from tests.unit.controlplane.samples import interfaces, path, registration, use
 

@@ -8,7 +8,7 @@ import pytest
 
 from controlplane.core.estimate.processing import ComputeTimes
 from protos.base.histogram import Histogram
-from protos.model import NodeName
+from protos.model.ids import NodeName
 from tests.unit.controlplane.samples import PLAN, histogram
 
 A, B, C = (NodeName(name) for name in "abc")

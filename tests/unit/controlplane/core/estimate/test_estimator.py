@@ -11,18 +11,9 @@ from controlplane.core.estimate import estimator as estimator_module
 from controlplane.core.estimate import network as network_module
 from controlplane.core.estimate import processing as compute_module
 from controlplane.core.estimate.estimator import LIVE_S, Estimator
-from protos.model import (
-    Assignment,
-    InterfaceJointReport,
-    InterfaceName,
-    JointReport,
-    LatencyReport,
-    NodeName,
-    OutcomeReport,
-    PathReport,
-    Report,
-    ServiceName,
-)
+from protos.model.ids import InterfaceName, NodeName, ServiceName
+from protos.model.mapping import Assignment
+from protos.model.report import InterfaceJointReport, JointReport, LatencyReport, OutcomeReport, PathReport, Report
 from tests.unit.controlplane.samples import PLAN, histogram, latency, path
 
 if TYPE_CHECKING:

@@ -17,7 +17,8 @@ from controlplane.core.estimate.posterior import IGNORANCE, MEMORIES, SCORE_HALF
 from controlplane.core.estimate.witnesses import COUNTS_ANYWAY, MAX_WITNESSES, MOST_ALONE, Witnesses
 from protos.base.histogram import BUCKETS, EDGES, MAX_S, MIDS, Histogram
 from protos.convert import parse_sidecar_message, sidecar_message_to_proto
-from protos.model import NodeName, Report
+from protos.model.ids import NodeName
+from protos.model.report import Report
 from tests.unit.controlplane.drawn_reports import DEADLINES_S, INTERFACES, ROBOTS, SERVERS, SERVICES, drawn_reports
 
 if TYPE_CHECKING:

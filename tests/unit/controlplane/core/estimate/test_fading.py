@@ -11,7 +11,7 @@ import pytest
 from controlplane.core.estimate.fading import FadedCount, FadedHistogram, FadedShares
 from protos.base.histogram import MAX_COUNT, Histogram
 from protos.base.size_class import SIZE_CLASSES
-from protos.explanation import SAMPLE
+from protos.model.explanation import SAMPLE
 from tests.unit.controlplane.samples import histogram
 
 HALF_LIFE_S = 60.0

@@ -11,7 +11,9 @@ from controlplane.core.estimate.forgetting import FORGET_S, forget_after_s
 from controlplane.core.estimate.processing import ComputeTimes
 from controlplane.core.publish.messages import CloseReason
 from controlplane.core.registry.registry import Refusal
-from protos.model import CandidateSet, InterfaceName, NodeName, OutcomeReport, Report, Role, ServiceName, ServiceSet
+from protos.model.ids import InterfaceName, NodeName, Role, ServiceName
+from protos.model.members import CandidateSet, ServiceSet
+from protos.model.report import OutcomeReport, Report
 from tests.unit.controlplane.samples import PLAN, histogram, interfaces, latency, offer, path, registration, use
 
 pytestmark = pytest.mark.audit("ops-24h")

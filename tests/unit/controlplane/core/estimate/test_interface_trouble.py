@@ -4,7 +4,7 @@ import pytest
 
 from controlplane.core.estimate.interface_trouble import InterfaceTrouble
 from controlplane.core.estimate.posterior import Estimate
-from protos.model import InterfaceName, NodeName
+from protos.model.ids import InterfaceName, NodeName
 
 WLAN = InterfaceName("wlan0")
 A, B = NodeName("cloud-a"), NodeName("cloud-b")

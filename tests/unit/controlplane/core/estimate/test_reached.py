@@ -6,7 +6,7 @@ import pytest
 
 from controlplane.core.estimate import reached as module
 from controlplane.core.estimate.reached import Reached
-from protos.model import NodeName
+from protos.model.ids import NodeName
 
 pytestmark = pytest.mark.audit("ops-12")
 

@@ -8,8 +8,9 @@ from typing import TYPE_CHECKING
 import pytest
 
 from controlplane.core.estimate.shared_fate import HALF_LIFE_S, SharedFate
-from protos.explanation import Correlation
-from protos.model import InterfaceJointReport, InterfaceName, ServiceName
+from protos.model.explanation import Correlation
+from protos.model.ids import InterfaceName, ServiceName
+from protos.model.report import InterfaceJointReport
 from sidecar.core.robot.measure.interface_outcomes import InterfacePair, JointCounts, PairOutcome
 
 if TYPE_CHECKING:

@@ -11,8 +11,11 @@ from controlplane.core.control.events import Settings
 from controlplane.core.explain.departed import MAX_DEPARTED, MAX_EXPLAINED, Departed, Departure
 from controlplane.core.explain.explanation import UnknownNameError
 from controlplane.core.policy.policy import CallRule, OfferRule, Policy
-from protos.fleet_events import Why
-from protos.model import Drain, NodeName, OutcomeReport, RemovalReason, Report, Role
+from protos.model.fleet_events import Why
+from protos.model.ids import NodeName, Role
+from protos.model.members import RemovalReason
+from protos.model.report import OutcomeReport, Report
+from protos.model.stream import Drain
 from tests.sim.control_world import SETTLED_S, SimSidecar, World
 from tests.unit.controlplane.samples import PLAN, histogram, latency, path
 

@@ -17,22 +17,10 @@ from controlplane.core.policy.policy import CallRule, OfferRule, Policy
 from controlplane.core.problem.objectives import joint_miss
 from controlplane.core.problem.problem import BlockKey, FleetKey, Objective, Target
 from controlplane.core.registry.registry import Sidecar
-from protos.model import (
-    Assignment,
-    Candidate,
-    InterfaceName,
-    JointReport,
-    NodeName,
-    PathReport,
-    PenaltyReport,
-    Report,
-    Role,
-    ServiceName,
-    ServiceOffer,
-    ServiceSet,
-    ServiceUse,
-)
-from protos.preferences import Copies, InterfaceLabel
+from protos.model.ids import InterfaceName, NodeName, Role, ServiceName
+from protos.model.mapping import Assignment
+from protos.model.members import Candidate, Copies, InterfaceLabel, ServiceOffer, ServiceSet, ServiceUse
+from protos.model.report import JointReport, PathReport, PenaltyReport, Report
 from tests.unit.controlplane.samples import (
     PLAN,
     candidate,

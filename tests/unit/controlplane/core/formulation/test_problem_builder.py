@@ -30,8 +30,9 @@ from controlplane.core.policy.permits import Permits
 from controlplane.core.policy.policy import CallRule, OfferRule, Policy
 from controlplane.core.problem.problem import Block, BlockKey, Objective
 from controlplane.core.registry.registry import Sidecar
-from protos.model import InterfaceName, NodeName, Report, Role, ServiceName, ServiceSet
-from protos.preferences import InterfaceLabel
+from protos.model.ids import InterfaceName, NodeName, Role, ServiceName
+from protos.model.members import InterfaceLabel, ServiceSet
+from protos.model.report import Report
 from tests.unit.controlplane.samples import PLAN, histogram, interfaces, latency, offer, path, registration, stream, use
 
 if TYPE_CHECKING:

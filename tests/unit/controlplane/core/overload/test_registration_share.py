@@ -9,13 +9,13 @@ import pytest
 from controlplane.core.base import member_table
 from controlplane.core.overload.registration_share import RETURN_COST, STARTS_BURST, STARTS_PER_S, RegistrationShare
 from controlplane.core.registry.registry import Admission, Refusal, Registry
-from protos.model import NodeName, Role
+from protos.model.ids import NodeName, Role
 from tests.unit.controlplane.samples import registration, stream
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from protos.model import Registration
+    from protos.model.members import Registration
 
 pytestmark = pytest.mark.audit("ops-16")
 

@@ -18,7 +18,8 @@ from controlplane.core.overload.report_share import (
     level,
 )
 from protos.convert.fields import MAX_OUTCOMES
-from protos.model import MAX_GOODBYES, MAX_JOINTS, MAX_LATENCIES, MAX_PATHS, MAX_PENALTIES, NodeName
+from protos.model.ids import NodeName
+from protos.model.report import MAX_GOODBYES, MAX_JOINTS, MAX_LATENCIES, MAX_PATHS, MAX_PENALTIES
 
 ROBOT = NodeName("robot")
 ENTRY_S = 40e-6

@@ -6,7 +6,7 @@ import pytest
 
 from controlplane.core.base import member_table
 from controlplane.core.overload.urgency import LEAST_PAIRS, PAIRS_BURST, PAIRS_PER_S, Urgency
-from protos.model import NodeName
+from protos.model.ids import NodeName
 
 ROBOT, OTHER = NodeName("robot"), NodeName("other")
 

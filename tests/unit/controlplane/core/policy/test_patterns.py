@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from controlplane.core.policy.patterns import NameKind, can_match, matches
 from protos.base.errors import DecodeError
-from protos.base.names import interface_name, node_name, service_name
+from protos.model.names import interface_name, node_name, service_name
 
 CHECKS = {NameKind.NODE: node_name, NameKind.SERVICE: service_name, NameKind.INTERFACE: interface_name}
 NAMES = {

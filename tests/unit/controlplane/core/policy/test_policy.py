@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from controlplane.core.policy.explain import MAX_CLOSE, explain
 from controlplane.core.policy.policy import CallRule, OfferRule, Policy
-from protos.model import NO_POLICY, POLICY_PENDING, NodeName, ServiceName
+from protos.model.ids import NodeName, ServiceName
+from protos.model.members import NO_POLICY, POLICY_PENDING
 
 ARM, BASE = NodeName("arm-1"), NodeName("base-1")
 A, B = NodeName("cloud-a"), NodeName("cloud-b")

@@ -22,8 +22,8 @@ from controlplane.core.problem.mode_miss import (
 )
 from controlplane.core.problem.objectives import joint_miss
 from controlplane.core.problem.problem import Block, BlockKey
-from protos.model import InterfaceName, NodeName
-from protos.redundancy_mode import RedundancyMode
+from protos.model.ids import InterfaceName, NodeName
+from protos.model.redundancy_mode import RedundancyMode
 from tests.unit.controlplane.samples import PLAN, use
 
 pytestmark = pytest.mark.audit("ops-12")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from controlplane.core.problem.problem import FleetKey, Problem, fleet_excess, is_valid
-from protos.model import NodeName
+from protos.model.ids import NodeName
 from tests.unit.controlplane.problems import PLAN, block
 
 CLOUD_0 = FleetKey(NodeName("cloud-0"), PLAN)

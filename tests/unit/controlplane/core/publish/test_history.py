@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING
 from controlplane.core.problem.problem import BlockKey
 from controlplane.core.publish import history as mapping_history
 from controlplane.core.publish.history import MAX_CHANGES, MappingHistory
-from protos.model import Assignment, InterfaceName, MappingSet, NodeName, ServiceMapping, Version
+from protos.model.ids import InterfaceName, NodeName, Version
+from protos.model.mapping import Assignment, MappingSet, ServiceMapping
 from tests.unit.controlplane.samples import PLAN
 
 if TYPE_CHECKING:

@@ -11,18 +11,9 @@ from controlplane.core.problem.plan import BlockPlan, Plan
 from controlplane.core.problem.problem import BlockKey, FleetKey, Problem
 from controlplane.core.publish.mappings import differs, mapping_of, reads_differently
 from controlplane.core.registry.registry import Sidecar
-from protos.model import (
-    ALL_CALLS,
-    Assignment,
-    CallPermit,
-    InterfaceName,
-    NodeName,
-    ServiceMapping,
-    ServiceName,
-    ServiceSet,
-    ServiceUse,
-)
-from protos.preferences import Copies
+from protos.model.ids import InterfaceName, NodeName, ServiceName
+from protos.model.mapping import Assignment, ServiceMapping
+from protos.model.members import ALL_CALLS, CallPermit, Copies, ServiceSet, ServiceUse
 from tests.unit.controlplane.samples import PLAN, interfaces, registration, stream, use
 
 KEY = BlockKey(NodeName("robot"), PLAN)

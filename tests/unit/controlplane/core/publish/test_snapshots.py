@@ -8,18 +8,10 @@ import pytest
 
 from controlplane.core.publish.snapshots import MAX_LIFTED, PeerView, Snapshots, Track, VersionSource
 from controlplane.core.publish.told_peers import ToldPeers
-from protos.model import (
-    MAX_VERSION,
-    Ack,
-    Nack,
-    NodeName,
-    Peer,
-    ResourceKind,
-    Role,
-    SessionId,
-    Version,
-)
-from protos.status import SyncState
+from protos.model.ids import MAX_VERSION, NodeName, Role, SessionId, Version
+from protos.model.members import Peer
+from protos.model.status import SyncState
+from protos.model.stream import Ack, Nack, ResourceKind
 
 EPOCH = 1000
 

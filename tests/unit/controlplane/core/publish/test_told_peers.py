@@ -5,7 +5,8 @@ from __future__ import annotations
 from dataclasses import fields, replace
 
 from controlplane.core.publish.told_peers import ToldPeers
-from protos.model import ALL_CALLS, NodeName, Peer, Role, SessionId
+from protos.model.ids import NodeName, Role, SessionId
+from protos.model.members import ALL_CALLS, Peer
 from protos.trust.pair_token import pair_token
 from tests.unit.controlplane.samples import interfaces, offer
 

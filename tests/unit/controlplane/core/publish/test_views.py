@@ -10,17 +10,8 @@ from controlplane.core.policy.permits import Permits
 from controlplane.core.policy.policy import CallRule, OfferRule, Policy
 from controlplane.core.publish.views import KnownPeers, Views
 from controlplane.core.registry.registry import Registry, Sidecar
-from protos.model import (
-    ALL_CALLS,
-    CallPermit,
-    CandidateSet,
-    NodeName,
-    RemovalReason,
-    RemovedPeer,
-    Role,
-    ServiceName,
-    ServiceSet,
-)
+from protos.model.ids import NodeName, Role, ServiceName
+from protos.model.members import ALL_CALLS, CallPermit, CandidateSet, RemovalReason, RemovedPeer, ServiceSet
 from tests.unit.controlplane.policies import CLOUDS, ROBOTS, SERVICES, policies
 from tests.unit.controlplane.samples import interfaces, offer, registration, stream
 

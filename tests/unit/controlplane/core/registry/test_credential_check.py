@@ -3,16 +3,20 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
 import pytest
 
 from controlplane.ca import Authority, Issued
 from controlplane.core.registry.credential_check import check_claims, check_unproven_claims
 from controlplane.core.registry.registry import Refusal
-from protos.model import NodeName, Registration, Role
+from protos.model.ids import NodeName, Role
 from protos.trust.credential import Aead, SessionCredential, session_number
 from protos.trust.identity import Identity, IdentityRole, Trust
 from tests.unit.controlplane.samples import registration as sample
+
+if TYPE_CHECKING:
+    from protos.model.members import Registration
 
 
 @pytest.fixture(scope="module")

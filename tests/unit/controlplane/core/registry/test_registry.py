@@ -9,7 +9,8 @@ import pytest
 from controlplane.core.overload.postponed import COUNTED_BURST
 from controlplane.core.registry import registry as registry_module
 from controlplane.core.registry.registry import MAX_POSTPONED, POSTPONE_S, Admission, Refusal, Registry
-from protos.model import CandidateSet, NodeName, RemovalReason, Role, ServiceSet
+from protos.model.ids import NodeName, Role
+from protos.model.members import CandidateSet, RemovalReason, ServiceSet
 from tests.unit.controlplane.samples import interfaces, offer, registration, stream
 
 ROBOT = NodeName("robot")

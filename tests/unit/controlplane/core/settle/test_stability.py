@@ -11,8 +11,8 @@ from controlplane.core.problem.plan import Plan, make_plan, price
 from controlplane.core.problem.problem import FleetKey, Objective, Problem, Target
 from controlplane.core.settle.stability import CHANGE_WINDOW_S, MAX_CHANGES, Stability
 from controlplane.solver.matcher import solve
-from protos.model import NodeName
-from protos.preferences import AT_MOST_EVERY_INTERFACE
+from protos.model.ids import NodeName
+from protos.model.members import AT_MOST_EVERY_INTERFACE
 from tests.unit.controlplane.problems import PLAN, block, choices_of, random_problem
 
 

@@ -8,7 +8,7 @@ import pytest
 
 from controlplane.core.problem.problem import FleetKey, Problem
 from controlplane.core.solve.grouping import independent_groups
-from protos.model import NodeName
+from protos.model.ids import NodeName
 from tests.unit.controlplane.problems import PLAN, best_price, block, random_problem
 
 CLOUD_0 = FleetKey(NodeName("cloud-0"), PLAN)

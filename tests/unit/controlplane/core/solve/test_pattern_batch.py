@@ -14,7 +14,7 @@ from controlplane.core.problem.problem import Block, Objective, Problem, block_e
 from controlplane.core.solve.enumeration import OWN_EXCESS_PRICE
 from controlplane.core.solve.limits import Limits
 from controlplane.core.solve.pattern_batch import PatternStack
-from protos.preferences import Copies
+from protos.model.members import Copies
 from tests.unit.controlplane.problems import block, plain_cost, random_problem, valid_choices
 
 if TYPE_CHECKING:

@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import pytest
 
-from protos.model import NodeName
+from protos.model.ids import NodeName
 from sidecar.core.base.fair_share import Shares
 from tests.unit.sidecar.core.builders import A, B
 

@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import itertools
 
-from protos.model import SessionId
+from protos.model.ids import SessionId
 from sidecar.core.base.request_id import REQUEST_ID_BYTES, make_request_id
 
 

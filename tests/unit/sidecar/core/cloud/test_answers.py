@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from protos.model import NodeName
+from protos.model.ids import NodeName
 from sidecar.core.base.slices import SLICE, Backlog
 from sidecar.core.base.values import PathState, Priority, RejectReason
 from sidecar.core.cloud import answers as answers_module

@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import pytest
 
-from protos.model import NodeName
+from protos.model.ids import NodeName
 from sidecar.core.base.fair_share import FORGOTTEN_AT_ONCE
 from sidecar.core.cloud.early_cancels import MAX_EARLY_CANCELS, REMEMBER_CANCEL_S, EarlyCancels
 from sidecar.core.seam.stats import EngineStats

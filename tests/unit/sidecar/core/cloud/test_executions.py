@@ -4,7 +4,7 @@ from itertools import pairwise
 
 import pytest
 
-from protos.model import NodeName, ServiceName
+from protos.model.ids import NodeName, ServiceName
 from sidecar.core.base.fair_share import FORGOTTEN_AT_ONCE
 from sidecar.core.base.slices import Backlog
 from sidecar.core.base.values import ExecutionId, RejectReason

@@ -2,7 +2,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from protos.model import NodeName, ServiceName, ServiceOffer
+from protos.model.ids import NodeName, ServiceName
+from protos.model.members import ServiceOffer
 from sidecar.core.base.slices import Backlog
 from sidecar.core.base.values import PathState, RejectReason
 from sidecar.core.cloud.forbidden_calls import MAX_ROBOTS, TELL_EVERY_S, ForbiddenCalls

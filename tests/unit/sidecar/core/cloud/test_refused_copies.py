@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from protos.model import NodeName
+from protos.model.ids import NodeName
 from sidecar.core.base.values import RejectReason
 from sidecar.core.cloud import refused_copies
 from sidecar.core.cloud.executions import MIN_REMEMBER_S, Reply, Waiter

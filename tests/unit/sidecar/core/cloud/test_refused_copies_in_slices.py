@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from protos.model import NodeName
+from protos.model.ids import NodeName
 from sidecar.core.base.fair_share import FORGOTTEN_AT_ONCE
 from sidecar.core.base.values import RejectReason, RequestId
 from sidecar.core.cloud.refused_copies import RefusedCopies, RefusedCopy

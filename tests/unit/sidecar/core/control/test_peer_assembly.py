@@ -7,7 +7,8 @@ from typing import Any
 
 import pytest
 
-from protos.model import MAX_PEERS, NodeName, Peer, PeerSet, RemovalReason, RemovedPeer, Role, SessionId, Version
+from protos.model.ids import NodeName, Role, SessionId, Version
+from protos.model.members import MAX_PEERS, Peer, PeerSet, RemovalReason, RemovedPeer
 from sidecar.core.control.peer_assembly import PeerAssembly
 
 SEEDS = range(200)

@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import pytest
 
-from protos.model import InterfaceName
+from protos.model.ids import InterfaceName
 from sidecar.core.control.race import ControlRace
 from sidecar.core.control.ways import STAGGER_S, Way, WayClass
 

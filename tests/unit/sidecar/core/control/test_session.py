@@ -10,35 +10,21 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from protos.base.histogram import Histogram
-from protos.model import (
+from protos.model.ids import (
     MAX_VERSION,
     PROTOCOL_VERSION,
-    Ack,
-    Candidate,
-    CandidateKind,
-    CandidateSet,
-    Drain,
-    Heartbeat,
     InterfaceId,
     InterfaceName,
-    MappingSet,
-    Nack,
     NodeName,
-    OutcomeReport,
-    PathReport,
-    PeerSet,
-    Registration,
-    Report,
-    ResourceKind,
     Role,
     ServiceName,
-    ServiceOffer,
-    ServiceSet,
     SessionId,
-    SidecarMessage,
     Version,
-    Welcome,
 )
+from protos.model.mapping import MappingSet
+from protos.model.members import Candidate, CandidateKind, CandidateSet, PeerSet, Registration, ServiceOffer, ServiceSet
+from protos.model.report import OutcomeReport, PathReport, Report
+from protos.model.stream import Ack, Drain, Heartbeat, Nack, ResourceKind, SidecarMessage, Welcome
 from sidecar.core.base.report_scope import ReportScope
 from sidecar.core.control.session import (
     MIN_INTERVAL_S,

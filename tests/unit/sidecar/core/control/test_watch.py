@@ -4,7 +4,7 @@ from collections import Counter
 
 import pytest
 
-from protos.model import InterfaceName
+from protos.model.ids import InterfaceName
 from sidecar.core.base.values import PathState
 from sidecar.core.control.watch import (
     CHEAPER,

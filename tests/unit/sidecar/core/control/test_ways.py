@@ -4,7 +4,7 @@ from collections import Counter
 
 import pytest
 
-from protos.model import Address, InterfaceName
+from protos.model.ids import Address, InterfaceName
 from sidecar.core.base.values import PathState
 from sidecar.core.control.ways import (
     ADDRESSES_FULL,

@@ -7,7 +7,7 @@ from cryptography.hazmat.primitives.asymmetric.x25519 import X25519PrivateKey
 from hypothesis import given
 from hypothesis import strategies as st
 
-from protos.model import InterfaceId, NodeName, Role, SessionId
+from protos.model.ids import InterfaceId, NodeName, Role, SessionId
 from protos.trust.credential import Aead, SessionCredential
 from sidecar.core.crypto.key_schedule import PairKeys, next_root, pair_keys, proof
 from tests.sessions import session_of, with_credential

@@ -1,16 +1,20 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
 import pytest
 
 from protos.base.errors import DecodeError
-from protos.model import NodeName, Peer, Role, SessionId
+from protos.model.ids import NodeName, Role, SessionId
 from protos.trust.credential import SessionCredential, decode_credential
 from sidecar.core.crypto import session as session_module
 from sidecar.core.crypto.session import OwnSession
 from tests.sessions import credential_of, private_key, session_of
 from tests.unit.sidecar.core.builders import A, B, peer
+
+if TYPE_CHECKING:
+    from protos.model.members import Peer
 
 ENDS_AT = 1000.0
 

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from protos.model import PeerSet, RemovalReason, RemovedPeer, Role, SessionId, Version
+from protos.model.ids import Role, SessionId, Version
+from protos.model.members import PeerSet, RemovalReason, RemovedPeer
 from sidecar.core.base.values import ExecutionId, PathState
 from sidecar.core.robot.request.service_catalog import WITHDRAW_AFTER_S
 from sidecar.core.seam.application import CancelExecution, ResponseArrived, WithdrawService

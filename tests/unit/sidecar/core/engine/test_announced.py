@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from protos.model import Candidate, CandidateKind, InterfaceId, InterfaceName, NodeName, Peer, PeerSet, Role, Version
+from protos.model.ids import InterfaceId, InterfaceName, NodeName, Role, Version
+from protos.model.members import Candidate, CandidateKind, Peer, PeerSet
 from protos.trust.candidate_signature import sign_candidates, verify_candidates
 from protos.trust.clock_floor import ClockFloor
 from protos.trust.identity import IdentityRole

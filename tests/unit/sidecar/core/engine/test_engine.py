@@ -4,22 +4,10 @@ from dataclasses import replace
 
 import pytest
 
-from protos.model import (
-    Assignment,
-    InterfaceName,
-    MappingSet,
-    NodeName,
-    Peer,
-    PeerSet,
-    Role,
-    ServiceMapping,
-    ServiceName,
-    ServiceOffer,
-    ServiceUse,
-    SessionId,
-    Version,
-)
-from protos.redundancy_mode import RedundancyMode
+from protos.model.ids import InterfaceName, NodeName, Role, ServiceName, SessionId, Version
+from protos.model.mapping import Assignment, MappingSet, ServiceMapping
+from protos.model.members import Peer, PeerSet, ServiceOffer, ServiceUse
+from protos.model.redundancy_mode import RedundancyMode
 from sidecar.core.base.report_scope import ReportScope
 from sidecar.core.base.values import PathId, PathState, Priority, RejectReason
 from sidecar.core.engine.engine import SWEEP_EVERY_S, Engine, EngineConfig

@@ -9,24 +9,18 @@ from typing import TYPE_CHECKING
 import pytest
 
 from protos.base.errors import DecodeError
-from protos.model import (
+from protos.model.ids import InterfaceId, InterfaceName, NodeName, Role, ServiceName, SessionId, Version
+from protos.model.members import (
     MAX_PEERS,
     NO_POLICY,
     POLICY_PENDING,
     CallPermit,
     Candidate,
     CandidateKind,
-    InterfaceId,
-    InterfaceName,
-    NodeName,
     Peer,
     PeerSet,
     RemovalReason,
     RemovedPeer,
-    Role,
-    ServiceName,
-    SessionId,
-    Version,
 )
 from protos.trust.identity import MALFORMED, NOT_YET_VALID, UNTRUSTED, CertificateError
 from sidecar.core.crypto.session import OwnSession

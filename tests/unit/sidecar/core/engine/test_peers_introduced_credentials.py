@@ -12,7 +12,8 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from protos.base.errors import DecodeError
-from protos.model import POLICY_PENDING, NodeName, PeerSet, Role, SessionId, Version
+from protos.model.ids import NodeName, Role, SessionId, Version
+from protos.model.members import POLICY_PENDING, PeerSet
 from protos.trust.credential import decode_credential
 from sidecar.core.crypto.session import OwnSession
 from sidecar.core.engine.peers import Peers
@@ -24,7 +25,7 @@ from tests.unit.sidecar.core.builders import A, B, peer
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from protos.model import Peer
+    from protos.model.members import Peer
     from protos.trust.credential import SessionCredential
 
 HELD = peer(A, session=1), peer(B, session=2)

@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import pytest
 
-from protos.model import NodeName
+from protos.model.ids import NodeName
 from sidecar.core.engine.verification_budget import LOOKS_AT_ONCE, VerificationBudget
 
 

@@ -4,7 +4,7 @@ import random
 
 import pytest
 
-from protos.model import InterfaceId, InterfaceName, NodeName, Role, SessionId
+from protos.model.ids import InterfaceId, InterfaceName, NodeName, Role, SessionId
 from sidecar.core.base.values import PathId, PathState
 from sidecar.core.link.link import Link
 from sidecar.core.path.congestion.rtt import UNSTABLE_FLOOR_S

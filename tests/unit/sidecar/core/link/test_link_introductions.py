@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from protos.model import InterfaceId, NodeName
+from protos.model.ids import InterfaceId, NodeName
 from sidecar.core.base.values import PathId, PathState
 from sidecar.core.link.path_table import MAX_PATHS_OF_A_PEER, NEW_PATHS, NEW_PATHS_PER_S
 from sidecar.core.path.probing import FIRST_PROBE_S

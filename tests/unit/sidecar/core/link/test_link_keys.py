@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from protos.base.errors import DecodeError
-from protos.model import InterfaceId, NodeName, Role, SessionId
+from protos.model.ids import InterfaceId, NodeName, Role, SessionId
 from sidecar.core.link.datagrams import LinkIdentity
 from sidecar.core.link.link import Link
 from sidecar.core.path.key_exchange import DEFAULT_LIMITS, EXCHANGES_AT_ONCE

@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from protos.model import InterfaceId
+from protos.model.ids import InterfaceId
 from sidecar.core.path.probing import FIRST_PROBE_S
 from sidecar.core.seam.links import Send
 from sidecar.core.wire import frame

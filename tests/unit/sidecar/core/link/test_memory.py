@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from protos.model import InterfaceId, NodeName, Role, SessionId
+from protos.model.ids import InterfaceId, NodeName, Role, SessionId
 from sidecar.core.link import memory as link_memory
 from sidecar.core.link.memory import MAX_PATHS_OF_A_PEER, LinkMemory
 from sidecar.core.path.key_exchange import DEFAULT_LIMITS

@@ -13,7 +13,7 @@ from tests.unit.sidecar.core.builders import PEER_ADDRESS, Bench, message, path
 from tests.unit.sidecar.core.link.test_link import up
 
 if TYPE_CHECKING:
-    from protos.model import Address
+    from protos.model.ids import Address
 
 PATH = path()
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from protos.model import InterfaceId
+from protos.model.ids import InterfaceId
 from sidecar.core.base.values import PathId, PathState
 from sidecar.core.link.pinging import LEAST_BYTES, MAX_PINGS_OUT, PINGS_AT_ONCE, PINGS_PER_S, Pong
 from sidecar.core.seam.links import Ping, SetCarrier

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from protos.model import NodeName, SessionId
+from protos.model.ids import NodeName, SessionId
 from sidecar.core.message import decoding
 from sidecar.core.message.decoding import MAX_BYTES, Decoding, DecodingLine
 from sidecar.core.message.outbound import OutboundMessage

@@ -4,7 +4,7 @@ from collections import Counter
 
 import pytest
 
-from protos.model import InterfaceId
+from protos.model.ids import InterfaceId
 from sidecar.core.base.values import PathId, PathState
 from sidecar.core.path.history import MAX_REMEMBERED, Change, PathHistory
 from sidecar.core.seam.links import PathChanged

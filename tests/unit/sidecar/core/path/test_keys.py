@@ -7,7 +7,7 @@ import pytest
 from cryptography.exceptions import InvalidTag
 
 from protos.base.errors import DecodeError
-from protos.model import InterfaceId, Role
+from protos.model.ids import InterfaceId, Role
 from protos.trust.credential import Aead
 from sidecar.core.crypto.aead import TAG_BYTES
 from sidecar.core.crypto.key_schedule import proof_of_offer

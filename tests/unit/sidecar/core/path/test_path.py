@@ -5,7 +5,7 @@ import random
 import pytest
 
 from protos.base.token_bucket import TokenBucket
-from protos.model import Address, InterfaceId, Role, SessionId
+from protos.model.ids import Address, InterfaceId, Role, SessionId
 from sidecar.core.base.values import PathState
 from sidecar.core.path.congestion.rtt import UNSTABLE_FLOOR_S
 from sidecar.core.path.key_exchange import DEFAULT_LIMITS

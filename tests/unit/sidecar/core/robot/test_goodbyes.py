@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from protos.model import MAX_GOODBYES, NodeName, SessionId
+from protos.model.ids import NodeName, SessionId
+from protos.model.report import MAX_GOODBYES
 from sidecar.core.robot.goodbyes import Goodbyes
 
 pytestmark = pytest.mark.audit("ops-11")

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import pytest
 
-from protos.model import ServiceName
+from protos.model.ids import ServiceName
 from sidecar.core.base.values import PathState, RejectReason
 from sidecar.core.rules.fallback_rule import FallbackRule
 from sidecar.core.seam.application import DeadlineMissed, ResponseArrived, Unreachable

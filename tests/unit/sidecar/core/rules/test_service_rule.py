@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import pytest
 
-from protos.model import ServiceName
+from protos.model.ids import ServiceName
 from sidecar.core.rules.fallback_rule import FallbackRule
 from sidecar.core.rules.service_rule import MAX_FOUND, Rules
 from tests.unit.sidecar.core.builders import rule

@@ -3,7 +3,7 @@ from __future__ import annotations
 import pytest
 
 from protos.base.errors import DecodeError
-from protos.model import InterfaceId, SessionId
+from protos.model.ids import InterfaceId, SessionId
 from sidecar.core.crypto.aead import TAG_BYTES
 from sidecar.core.wire import frame
 from sidecar.core.wire.frame import AckFrame, Close, Finished, Fragment, Header, Probe, ProbeReply

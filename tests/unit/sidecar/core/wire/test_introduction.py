@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from protos.base.errors import DecodeError
-from protos.model import InterfaceId, NodeName, Role, SessionId
+from protos.model.ids import InterfaceId, NodeName, Role, SessionId
 from sidecar.core.wire.frame import BASE_BYTES, Header, KeyOffer
 from sidecar.core.wire.introduction import (
     MAX_INTRODUCED_BYTES,

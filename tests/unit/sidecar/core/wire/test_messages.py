@@ -4,7 +4,7 @@ import pytest
 
 from protos.base.errors import DecodeError, UnknownKindError
 from protos.convert.fields import MAX_CRL_BYTES
-from protos.model import ServiceName
+from protos.model.ids import ServiceName
 from sidecar.core.base.values import Priority, RejectReason, RequestId
 from sidecar.core.wire.messages import (
     MAX_PAYLOAD_BYTES,

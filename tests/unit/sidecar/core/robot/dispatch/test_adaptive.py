@@ -6,7 +6,7 @@ import dataclasses
 
 import pytest
 
-from protos.redundancy_mode import RedundancyMode
+from protos.model.redundancy_mode import RedundancyMode
 from sidecar.core.base.values import PathState
 from sidecar.core.robot.dispatch.adaptive import SPREAD, UNFORESEEN, late_probability
 from sidecar.core.rules.budget import Budget

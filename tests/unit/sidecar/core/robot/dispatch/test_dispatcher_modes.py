@@ -6,7 +6,7 @@ import dataclasses
 
 import pytest
 
-from protos.redundancy_mode import RedundancyMode
+from protos.model.redundancy_mode import RedundancyMode
 from sidecar.core.base.values import PathId, PathState, RejectReason
 from sidecar.core.robot.request.request import HEDGE_AT
 from sidecar.core.rules.budget import Budget

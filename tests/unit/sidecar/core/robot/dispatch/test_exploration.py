@@ -8,7 +8,8 @@ from dataclasses import replace
 
 import pytest
 
-from protos.model import Assignment, MappingSet, ServiceMapping, Version
+from protos.model.ids import Version
+from protos.model.mapping import Assignment, MappingSet, ServiceMapping
 from sidecar.core.base.values import PathId, PathState, RejectReason, RequestId
 from sidecar.core.robot.dispatch.exploration import (
     MAX_PER_S,

@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import pytest
 
-from protos.model import NodeName
+from protos.model.ids import NodeName
 from sidecar.core.robot.dispatch.penalties import FIRST_S, HALF_LIFE_S, LONGEST_S, MAX_SERVERS, Penalties
 
 A, B = NodeName("cloud-a"), NodeName("cloud-b")

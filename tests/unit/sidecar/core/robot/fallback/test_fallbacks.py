@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from protos.model import ServiceName
+from protos.model.ids import ServiceName
 from sidecar.core.robot.fallback import fallbacks, queue
 from sidecar.core.robot.fallback.fallbacks import Accepted, Fallbacks
 from sidecar.core.rules.fallback_rule import FallbackRule

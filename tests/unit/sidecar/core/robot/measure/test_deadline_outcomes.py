@@ -15,7 +15,7 @@ from sidecar.core.transfer.routes import Routes
 from tests.unit.sidecar.core.builders import ECHO, TYPE, WLAN, WWAN, A, B, path, request_id
 
 if TYPE_CHECKING:
-    from protos.model import Report
+    from protos.model.report import Report
     from sidecar.core.base.values import PathId
     from sidecar.core.message.outbound import OutboundMessage
 

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from protos.redundancy_mode import RedundancyMode
+from protos.model.redundancy_mode import RedundancyMode
 from sidecar.core.base.request_id import OBSERVED_ONE_IN
 from sidecar.core.base.values import PathState
 from sidecar.core.robot.measure.interface_outcomes import interface_outcomes
@@ -16,7 +16,7 @@ from sidecar.core.transfer.routes import Routes
 from tests.unit.sidecar.core.builders import ECHO, TYPE, WLAN, WWAN, A, B, path, request_id
 
 if TYPE_CHECKING:
-    from protos.model import InterfaceName
+    from protos.model.ids import InterfaceName
     from sidecar.core.base.values import PathId
     from sidecar.core.message.outbound import OutboundMessage
 

@@ -6,16 +6,9 @@ from dataclasses import replace
 import pytest
 
 from protos.convert import parse_sidecar_message, sidecar_message_to_proto
-from protos.model import (
-    MAX_PATHS,
-    Assignment,
-    InterfaceJointReport,
-    InterfaceName,
-    JointReport,
-    NodeName,
-    OutcomeReport,
-    ServiceName,
-)
+from protos.model.ids import InterfaceName, NodeName, ServiceName
+from protos.model.mapping import Assignment
+from protos.model.report import MAX_PATHS, InterfaceJointReport, JointReport, OutcomeReport
 from sidecar.core.base.report_scope import ReportScope
 from sidecar.core.base.values import PathState
 from sidecar.core.robot.measure import measurements as measurements_module

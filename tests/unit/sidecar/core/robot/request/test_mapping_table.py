@@ -1,6 +1,7 @@
 from __future__ import annotations
 
-from protos.model import Assignment, InterfaceName, MappingSet, NodeName, ServiceMapping, Version
+from protos.model.ids import InterfaceName, NodeName, Version
+from protos.model.mapping import Assignment, MappingSet, ServiceMapping
 from sidecar.core.base.values import PathId, PathState
 from sidecar.core.robot.request.mapping_table import MappingTable
 from sidecar.core.transfer.routes import Routes

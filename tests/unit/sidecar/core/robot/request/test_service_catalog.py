@@ -5,7 +5,8 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from protos.model import Peer, ServiceName, ServiceOffer
+from protos.model.ids import ServiceName
+from protos.model.members import Peer, ServiceOffer
 from sidecar.core.base.values import PathState
 from sidecar.core.robot.request import service_catalog
 from sidecar.core.robot.request.service_catalog import MAX_OFFERED, WITHDRAW_AFTER_S, Offers

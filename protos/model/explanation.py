@@ -12,9 +12,10 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from protos.base.histogram import Histogram
-    from protos.fleet_events import Why
-    from protos.model import Assignment, InterfaceName, NodeName, ServiceMapping, ServiceName, Version
-    from protos.status import ResourceStatus
+    from protos.model.fleet_events import Why
+    from protos.model.ids import InterfaceName, NodeName, ServiceName, Version
+    from protos.model.mapping import Assignment, ServiceMapping
+    from protos.model.status import ResourceStatus
 
 SAMPLE = 1000
 """What one sample that has not faded counts in a histogram."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING, NamedTuple
 
-from protos.model import HeldList, RevocationSet
+from protos.model.members import HeldList, RevocationSet
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping

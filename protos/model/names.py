@@ -6,7 +6,7 @@ import re
 from functools import lru_cache
 
 from protos.base.errors import DecodeError
-from protos.model import InterfaceName, NodeName, ServiceName
+from protos.model.ids import InterfaceName, NodeName, ServiceName
 
 MAX_STRING_BYTES = 255
 """Longest string, UTF-8: ROS names its limit for topic and service names 255 too."""

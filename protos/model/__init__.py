@@ -1,0 +1,1 @@
+"""The words both planes speak: frozen values and typed identifiers. Imports `base`."""
