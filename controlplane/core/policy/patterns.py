@@ -29,7 +29,7 @@ class NameKind(enum.Enum):
 
 _State = tuple[tuple[frozenset[str], int], ...]
 _STATES: dict[NameKind, tuple[tuple[_State, ...], int]] = {
-    # What `protos.model.names` lets pass, as automata: where each state leads by which characters; the last one accepts.
+    # What `protos.model.names` lets pass, as automata: where each state leads by which characters. The last accepts.
     NameKind.NODE: ((((_ALNUM, 1),), ((_ALNUM | frozenset("_.-"), 1),)), 1),
     # Printable ASCII but for the slash.
     NameKind.INTERFACE: ((((_GRAPHIC, 1),), ((_GRAPHIC, 1),)), 1),

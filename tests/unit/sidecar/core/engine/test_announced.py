@@ -21,7 +21,7 @@ from sidecar.core.engine.peers import Peers
 from sidecar.state.start_session import start_session
 from tests.sessions import session_of
 from tests.unit.sidecar.core.builders import peer
-from tests.unit.sidecar.test_start_session import Fleet
+from tests.unit.sidecar.state.test_start_session import Fleet
 
 if TYPE_CHECKING:
     from pathlib import Path

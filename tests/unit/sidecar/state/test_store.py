@@ -330,7 +330,7 @@ def test_a_kill_in_the_middle_of_writing_leaves_a_whole_file(tmp_path: Path) -> 
     versions = []
     for attempt in range(4):
         argv = [sys.executable, "-c", WRITE_FOR_EVER, str(tmp_path)]
-        root = Path(__file__).parents[3]
+        root = Path(__file__).parents[4]
         with subprocess.Popen(argv, stdout=subprocess.PIPE, cwd=root) as process:
             assert process.stdout
             assert process.stdout.readline() == b"busy\n"
@@ -349,7 +349,7 @@ def test_a_card_gone_read_only_still_yields_the_last_mapping(tmp_path: Path) -> 
     script = f"""
     set -e
     mount -t tmpfs none {tmp_path}
-    cd {Path(__file__).parents[3]}
+    cd {Path(__file__).parents[4]}
     {sys.executable} -c '{OPEN_AND_REMEMBER}' {tmp_path} 5
     mount -o remount,ro {tmp_path}
     {sys.executable} -c '{OPEN_AND_REMEMBER}' {tmp_path} 6

@@ -14,7 +14,7 @@ from protos.program.endings import ends_quietly
 
 pytestmark = pytest.mark.audit("ops-14")
 
-ROOT = Path(__file__).parents[3]
+ROOT = Path(__file__).parents[4]
 PROGRAMS = [
     ["protos.program.command_line", "config", "schema", "controlplane"],
     ["sidecar", "--print-schema"],
