@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import pytest
 from hypothesis import HealthCheck, settings
 
-from tests.ros_domains import leased_domain
+from tests.support.ros_domains import leased_domain
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

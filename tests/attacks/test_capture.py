@@ -14,7 +14,7 @@ import pytest
 
 from sidecar.core.wire.frame import HEADER_BYTES
 from tests.attacks.world import CLOUDS, World, is_ours
-from tests.netns.calling import Call, assert_flawless
+from tests.support.calling import Call, assert_flawless
 
 if TYPE_CHECKING:
     from lab.attacker.wire import Captured

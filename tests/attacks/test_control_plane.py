@@ -21,8 +21,8 @@ from lab.attacker.control_client import CONNECT, CONTROL_PLANE_DNS
 from lab.system import CONTROL_PORT
 from protos.model.ids import Role
 from protos.trust.identity import IdentityRole
-from tests.attacks.registrations import registration
 from tests.attacks.world import ATTACKER, World
+from tests.support.registrations import registration
 
 if TYPE_CHECKING:
     from pathlib import Path

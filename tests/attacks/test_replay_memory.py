@@ -18,13 +18,13 @@ from sidecar.core.path.keys import make_path_keys
 from sidecar.core.wire import frame
 from sidecar.core.wire.frame import Header
 from sidecar.core.wire.introduction import encode_introduction
-from tests.sessions import credential_of, seal, session_of
-from tests.sim.mesh import Mesh, rule
+from tests.support.mesh import Mesh, rule
+from tests.support.sessions import credential_of, seal, session_of
 
 if TYPE_CHECKING:
     from protos.model.ids import Address
     from sidecar.core.link.link import Link
-    from tests.sim.mesh import Node
+    from tests.support.mesh import Node
 
 pytestmark = pytest.mark.audit("sec-1")
 

@@ -9,7 +9,7 @@ import pytest
 from lab.attacker.rogue_cloud import SHARE
 from lab.system import System
 from tests.attacks.world import World, attack_lab
-from tests.netns.calling import Call
+from tests.support.calling import Call
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

@@ -14,7 +14,7 @@ from controlplane.ca.files import write_atomically, write_tls_files
 from lab.system import CONTROL_METRICS_PORT, METRICS_PORT, System
 from protos.program.tls_files import CA_FILE, CRL_FILE
 from tests.attacks.world import World, attack_lab, is_ours
-from tests.netns.calling import Call, assert_flawless
+from tests.support.calling import Call, assert_flawless
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

@@ -12,8 +12,8 @@ from protos.model.ids import Role, Version
 from protos.model.members import PeerSet
 from protos.trust.credential import session_number
 from protos.trust.identity import MALFORMED, CertificateError
-from tests.sessions import session_of
-from tests.sim.mesh import Mesh, rule
+from tests.support.mesh import Mesh, rule
+from tests.support.sessions import session_of
 
 if TYPE_CHECKING:
     from protos.trust.credential import SessionCredential

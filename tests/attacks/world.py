@@ -20,7 +20,7 @@ from lab import Lab, LabConfig, LinkProfile, robot, server
 from lab.attacker.wire import Tap
 from lab.system import CONTROL_METRICS_PORT, METRICS_PORT
 from protos.program.tls_files import CRL_FILE
-from tests.netns.calling import Call
+from tests.support.calling import Call
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence

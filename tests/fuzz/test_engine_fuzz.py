@@ -26,8 +26,8 @@ from sidecar.core.wire.messages import (
     ResponseMessage,
     encode_message,
 )
-from tests.sessions import seal
-from tests.sim.mesh import SERVICE, TYPE, Mesh, Node, rule
+from tests.support.mesh import SERVICE, TYPE, Mesh, Node, rule
+from tests.support.sessions import seal
 
 if TYPE_CHECKING:
     import random

@@ -12,7 +12,7 @@ from controlplane.ca import Authority
 from protos.model.ids import NodeName, Role, SessionId
 from protos.trust.credential import Aead, SessionCredential, verify
 from protos.trust.identity import CertificateError, IdentityRole, Trust
-from tests.unit.protos.forged import NOW, Recipe, uri
+from tests.support.forged import NOW, Recipe, uri
 
 CA = Authority.create(clock=lambda: NOW)
 GOOD = CA.issue("robot-1", IdentityRole.ROBOT).certificate_der

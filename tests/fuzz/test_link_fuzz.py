@@ -15,16 +15,7 @@ from sidecar.core.link.path_table import MAX_PATHS_OF_A_PEER, MAX_PENDING_FRAMES
 from sidecar.core.seam.links import FragmentsReceived, Send
 from sidecar.core.wire import frame
 from sidecar.core.wire.frame import MAX_ACK_RANGES, Header, Probe, ProbeReply
-from tests.unit.sidecar.core.builders import (
-    OUR_TOKEN,
-    PEER_ADDRESS,
-    PEER_SESSION,
-    PEER_TOKEN,
-    WLAN,
-    A,
-    Bench,
-    message,
-)
+from tests.support.builders import OUR_TOKEN, PEER_ADDRESS, PEER_SESSION, PEER_TOKEN, WLAN, A, Bench, message
 
 numbers = st.integers(0, 60) | st.integers(0, 2**64 - 1)
 acks = st.lists(st.tuples(st.integers(0, 5), st.integers(0, 5)), min_size=1, max_size=40)

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from sidecar.ros.errors import RosBridgeError
 from sidecar.ros.graph.participant_info import nodes_of
 from sidecar.ros.graph.unknown_nodes import UnknownNodes
-from tests.unit.sidecar.ros.participant_messages import endpoint, participant_info
+from tests.support.participant_messages import endpoint, participant_info
 
 WRITERS = [endpoint(7, number) for number in range(6)]
 INFO = participant_info(7, [("/", "planner", WRITERS[:1], WRITERS[1:3]), ("/arm", "other", [], WRITERS[3:])])

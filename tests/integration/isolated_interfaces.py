@@ -31,7 +31,7 @@ from sidecar.core.seam.application import ApplicationEvent, OfferService, Reques
 from sidecar.core.seam.links import SetReady
 from sidecar.net.dataplane import DataPlaneHooks, ThreadedDataPlane
 from sidecar.net.interface_thread import InterfaceThread
-from tests.sessions import session_of
+from tests.support.sessions import session_of
 
 if TYPE_CHECKING:
     from collections.abc import Mapping

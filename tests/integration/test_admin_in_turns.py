@@ -23,7 +23,7 @@ from protos.model.ids import InterfaceName, NodeName, Role
 from protos.model.members import CandidateSet, ServiceSet
 from protos.model.report import PathReport, Report
 from protos.plr.v1 import admin_pb2, admin_pb2_grpc
-from tests.unit.controlplane.samples import histogram, interfaces, offer, registration, use
+from tests.support.samples import histogram, interfaces, offer, registration, use
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable

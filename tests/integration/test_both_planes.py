@@ -15,8 +15,8 @@ from protos.model.status import SyncState
 from sidecar.control.client import ControlClient
 from sidecar.core.control.session import ControlSession
 from sidecar.net.control_dialer import ControlDialer
-from tests.integration.control_plane_process import PATIENCE_S, ControlPlaneProcess, cloud
-from tests.unit.controlplane.samples import interfaces, path, registration, use
+from tests.support.control_plane_process import PATIENCE_S, ControlPlaneProcess, cloud
+from tests.support.samples import interfaces, path, registration, use
 
 if TYPE_CHECKING:
     from pathlib import Path

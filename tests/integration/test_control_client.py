@@ -39,8 +39,8 @@ from sidecar.control.client import ControlClient
 from sidecar.core.control import session as control_session
 from sidecar.core.control.session import ControlSession
 from sidecar.net.control_dialer import ControlDialer
-from tests.free_ports import free_port
 from tests.integration.scripted_control_plane import END, WAIT_S, ScriptedControlPlane
+from tests.support.free_ports import free_port
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

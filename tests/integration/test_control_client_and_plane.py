@@ -36,8 +36,8 @@ from sidecar.control.client import ControlClient
 from sidecar.core.control import session
 from sidecar.core.control.session import ControlSession
 from sidecar.net.control_dialer import ControlDialer
-from tests.free_ports import free_port
 from tests.integration.scripted_control_plane import WAIT_S
+from tests.support.free_ports import free_port
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator

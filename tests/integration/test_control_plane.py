@@ -15,8 +15,8 @@ from protos.model.members import PeerSet, RemovalReason
 from protos.model.report import OutcomeReport, Report
 from protos.model.status import SyncState
 from protos.model.stream import Ack, Drain, ResourceKind, Welcome
-from tests.integration.control_plane_process import ControlPlaneProcess, Stream, cloud, robot
-from tests.unit.controlplane.samples import PLAN, histogram, latency, path, registration
+from tests.support.control_plane_process import ControlPlaneProcess, Stream, cloud, robot
+from tests.support.samples import PLAN, histogram, latency, path, registration
 
 if TYPE_CHECKING:
     from pathlib import Path

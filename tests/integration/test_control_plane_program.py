@@ -17,7 +17,7 @@ import pytest
 import yaml
 
 from protos.model.stream import Welcome
-from tests.integration.control_plane_process import PATIENCE_S, ControlPlaneProcess, cloud
+from tests.support.control_plane_process import PATIENCE_S, ControlPlaneProcess, cloud
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -12,8 +12,8 @@ from protos.convert import sidecar_message_to_proto
 from protos.model.ids import PROTOCOL_VERSION, Role
 from protos.model.stream import Welcome
 from protos.plr.v1 import control_pb2
-from tests.integration.control_plane_process import PATIENCE_S, ControlPlaneProcess, Sidecar, Stream, cloud
-from tests.unit.controlplane.samples import registration
+from tests.support.control_plane_process import PATIENCE_S, ControlPlaneProcess, Sidecar, Stream, cloud
+from tests.support.samples import registration
 
 
 def test_a_name_in_use_by_another_is_refused(plane: ControlPlaneProcess) -> None:

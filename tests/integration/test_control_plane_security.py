@@ -25,17 +25,9 @@ from protos.model.report import Report
 from protos.model.stream import Welcome
 from protos.plr.v1 import admin_pb2, admin_pb2_grpc, control_pb2
 from protos.trust.identity import CONTROL_PLANE_DNS, IdentityRole
-from tests.integration.control_plane_process import (
-    PATIENCE_S,
-    Secured,
-    Sidecar,
-    Stream,
-    cloud,
-    open_channel,
-    robot,
-)
-from tests.integration.secured_control_plane import HOUR_S, SecuredControlPlane
-from tests.unit.controlplane.samples import registration
+from tests.support.control_plane_process import PATIENCE_S, Secured, Sidecar, Stream, cloud, open_channel, robot
+from tests.support.samples import registration
+from tests.support.secured_control_plane import HOUR_S, SecuredControlPlane
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

@@ -22,8 +22,8 @@ from protos.model.report import OutcomeReport, Report
 from protos.model.status import SyncState
 from protos.model.stream import Heartbeat
 from protos.stun.codec import MessageClass, StunMessage, decode, encode
-from tests.integration.control_plane_process import PATIENCE_S, ControlPlaneProcess, cloud, robot
-from tests.unit.controlplane.samples import PLAN, histogram, path
+from tests.support.control_plane_process import PATIENCE_S, ControlPlaneProcess, cloud, robot
+from tests.support.samples import PLAN, histogram, path
 
 
 def test_health_and_reflection(plane: ControlPlaneProcess) -> None:

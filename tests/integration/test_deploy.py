@@ -29,7 +29,7 @@ from sidecar.control.revocations import RevocationState
 from sidecar.core.control.session import ControlStats
 from sidecar.core.seam.stats import EngineStats
 from sidecar.observe.metrics import MetricSources, SidecarCollector
-from tests.free_ports import free_port
+from tests.support.free_ports import free_port
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

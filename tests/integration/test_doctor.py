@@ -22,9 +22,9 @@ from protos.trust.identity import IdentityRole
 from sidecar.doctor import command, ping_command
 from sidecar.local.client import LocalClient
 from sidecar.state.file import decode_identity
-from tests.free_ports import free_port
-from tests.integration.control_plane_process import ControlPlaneProcess
 from tests.integration.test_sidecar_program import Program, environment
+from tests.support.control_plane_process import ControlPlaneProcess
+from tests.support.free_ports import free_port
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

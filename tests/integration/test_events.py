@@ -14,8 +14,8 @@ import pytest
 
 from controlplane.cli.__main__ import main
 from protos.trust.identity import IdentityRole
-from tests.integration.control_plane_process import HEARTBEAT_S, PATIENCE_S, ControlPlaneProcess, Sidecar, cloud, robot
-from tests.integration.secured_control_plane import SecuredControlPlane
+from tests.support.control_plane_process import HEARTBEAT_S, PATIENCE_S, ControlPlaneProcess, Sidecar, cloud, robot
+from tests.support.secured_control_plane import SecuredControlPlane
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator

@@ -10,8 +10,8 @@ import pytest
 from controlplane.cli.__main__ import main
 from protos.model.report import Report
 from protos.plr.v1 import admin_pb2, admin_pb2_grpc
-from tests.integration.control_plane_process import PATIENCE_S, ControlPlaneProcess, cloud, robot
-from tests.unit.controlplane.samples import histogram, latency, path
+from tests.support.control_plane_process import PATIENCE_S, ControlPlaneProcess, cloud, robot
+from tests.support.samples import histogram, latency, path
 
 
 def explain(plane: ControlPlaneProcess, *arguments: str) -> int:

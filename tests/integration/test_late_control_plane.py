@@ -12,14 +12,14 @@ import pytest
 
 from protos.model.members import PeerSet
 from protos.trust.identity import IdentityRole
-from tests.integration.control_plane_process import PATIENCE_S, cloud, robot
-from tests.integration.secured_control_plane import SecuredControlPlane
+from tests.support.control_plane_process import PATIENCE_S, cloud, robot
+from tests.support.secured_control_plane import SecuredControlPlane
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
     from pathlib import Path
 
-    from tests.integration.control_plane_process import Sidecar
+    from tests.support.control_plane_process import Sidecar
 
 LEASE_S = 2.0
 EXPIRED = 'plr_departures_total{reason="lease_expired"}'

@@ -8,7 +8,7 @@ import pytest
 
 from protos.model.ids import NodeName, ServiceName
 from protos.model.members import NO_POLICY, RemovalReason, RemovedPeer
-from tests.integration.control_plane_process import ControlPlaneProcess, cloud, robot
+from tests.support.control_plane_process import ControlPlaneProcess, cloud, robot
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

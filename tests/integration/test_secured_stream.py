@@ -27,8 +27,7 @@ from sidecar.control.announcement import Announcer
 from sidecar.control.client import ControlClient
 from sidecar.core.control.session import ControlSession
 from sidecar.net.control_dialer import ControlDialer
-from tests.free_ports import free_port
-from tests.integration.control_plane_process import (
+from tests.support.control_plane_process import (
     PATIENCE_S,
     ControlPlaneProcess,
     Sidecar,
@@ -36,8 +35,9 @@ from tests.integration.control_plane_process import (
     credential_of,
     with_own_session,
 )
-from tests.integration.secured_control_plane import HOUR_S, SecuredControlPlane
-from tests.unit.controlplane.samples import interfaces, registration, use
+from tests.support.free_ports import free_port
+from tests.support.samples import interfaces, registration, use
+from tests.support.secured_control_plane import HOUR_S, SecuredControlPlane
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

@@ -22,9 +22,9 @@ from protos.model.mapping import Assignment, MappingSet, ServiceMapping
 from protos.model.members import CandidateSet, InterfaceLabel, Peer, PeerSet, Registration
 from protos.model.stream import Welcome
 from sidecar.state.store import StateStore
-from tests.free_ports import free_port
 from tests.integration.scripted_control_plane import WAIT_S, ScriptedControlPlane
-from tests.sessions import with_credential
+from tests.support.free_ports import free_port
+from tests.support.sessions import with_credential
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

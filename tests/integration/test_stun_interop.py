@@ -21,7 +21,7 @@ from controlplane.serve.stun_server import SHARE, StunServer, start_stun_server
 from protos.stun.codec import MessageClass, StunMessage, decode, encode
 from sidecar.core.stun.client import StunClient
 from sidecar.core.stun.events import Mapped, StunEvent
-from tests.free_ports import free_port
+from tests.support.free_ports import free_port
 
 if TYPE_CHECKING:
     from collections import Counter

@@ -14,8 +14,8 @@ import pytest
 
 from lab import Lab, LabConfig
 from lab.system import System
-from tests.netns.calling import Call
 from tests.netns.two_clouds import CLOUDS, executed, make_links_good
+from tests.support.calling import Call
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -59,7 +59,7 @@ def offers(log: str) -> int:
 
 @pytest.mark.parametrize("where", ["on the host", "in a container"])
 def test_a_server_killed_under_requests_that_may_run_only_once(system: System, where: str) -> None:
-    inside = ["-m", "tests.ros.in_a_namespace", sys.executable] if where == "in a container" else []
+    inside = ["-m", "tests.support.in_a_namespace", sys.executable] if where == "in a container" else []
     for cloud in CLOUDS:
         serve(system, cloud, *inside)
     system.wait_for_offer(system.parts["robot.sidecar"])

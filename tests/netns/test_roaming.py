@@ -13,7 +13,7 @@ import pytest
 from lab import Lab, LabConfig, LinkProfile
 from lab.system import System
 from tests.netns.cables import plug_in, pull_out
-from tests.netns.calling import Call, assert_flawless, counter
+from tests.support.calling import Call, assert_flawless, counter
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

@@ -13,7 +13,7 @@ import pytest
 
 from lab import Lab, LabConfig, LinkProfile
 from lab.system import CONTROL_PORT, STUN_PORT, System
-from tests.netns.calling import Call, assert_flawless, counter
+from tests.support.calling import Call, assert_flawless, counter
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from tests.netns.calling import Call, assert_flawless, counter
 from tests.netns.two_clouds import CLOUDS, executed, make_links_good, offered, two_clouds
+from tests.support.calling import Call, assert_flawless, counter
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

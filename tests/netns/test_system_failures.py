@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from tests.netns.calling import Call, assert_flawless, counter
 from tests.netns.two_clouds import CLOUDS, DEADLINE_MS, ROBOT_SERVICES, make_links_good, start_cloud, two_clouds
+from tests.support.calling import Call, assert_flawless, counter
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

@@ -263,7 +263,7 @@ def test_who_wants_a_processor() -> None:
 def test_a_killed_server_in_another_process_namespace(mesh: Mesh) -> None:
     mesh.start()
     inside = [sys.executable, "-m", "tests.ros.app", "serve", "--plan", "/plan"]
-    program = mesh.run(mesh.cloud_domain, *inside, module="tests.ros.in_a_namespace")
+    program = mesh.run(mesh.cloud_domain, *inside, module="tests.support.in_a_namespace")
     mesh.wait_carried("/plan")
     mesh.call("/plan", "--count", "60", "--tolerance", "-1", "--timeout-s", "1")
     wait_until(lambda: mesh.cloud.stats.pending == 60, "60 requests in the cloud")

@@ -15,8 +15,8 @@ from typing import TYPE_CHECKING, Any, Self
 import pytest
 import yaml
 
-from tests.free_ports import free_port
 from tests.ros.processes import Program
+from tests.support.free_ports import free_port
 
 if TYPE_CHECKING:
     from types import TracebackType

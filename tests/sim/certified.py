@@ -12,7 +12,7 @@ from protos.trust.clock_floor import ClockFloor
 from protos.trust.identity import IdentityRole
 from sidecar.control.announcement import Announcer
 from sidecar.state.start_session import signed, start_session
-from tests.sim.mesh import Mesh
+from tests.support.mesh import Mesh
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from protos.program.tls_files import TlsFiles
     from protos.trust.credential import SessionCredential
     from sidecar.core.crypto.session import OwnSession
-    from tests.sim.mesh import Node
+    from tests.support.mesh import Node
 
 
 class CertifiedMesh(Mesh):

@@ -31,8 +31,8 @@ from protos.model.members import (
     ServiceUse,
 )
 from protos.model.status import SyncState
-from tests.sim.control_world import SimSidecar, World
-from tests.unit.controlplane.samples import PLAN_TYPE, interfaces, offer, path, registration, use
+from tests.support.control_world import SimSidecar, World
+from tests.support.samples import PLAN_TYPE, interfaces, offer, path, registration, use
 
 if TYPE_CHECKING:
     from controlplane.core.policy.policy import Policy

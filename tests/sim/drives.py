@@ -21,8 +21,8 @@ from bench.evaluation.scenario import Scenario, read_scenarios
 from controlplane.planning.fifo import FifoLink
 from lab.trace_folder import read_folder
 from protos.model.redundancy_mode import RedundancyMode
-from tests.sim.mesh import IPV6, Mesh, Node, rule
 from tests.sim.test_mesh import mapped
+from tests.support.mesh import IPV6, Mesh, Node, rule
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

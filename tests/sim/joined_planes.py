@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from controlplane.core.registry.registry import StreamId
     from protos.model.ids import NodeName
     from protos.model.stream import ControlMessage
-    from tests.sim.mesh import Mesh, Node
+    from tests.support.mesh import Mesh, Node
 
 STEP_S = 0.02
 """How often the two planes exchange what they have to say."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from tests.sim.mesh import IPV6, Mesh
+from tests.support.mesh import IPV6, Mesh
 
 if TYPE_CHECKING:
     from protos.model.ids import Address

@@ -11,7 +11,7 @@ from sidecar.core.seam.application import AbandonExecution, ApplicationEvent, Ca
 from sidecar.ros.cloud.request_window import RequestWindow
 
 if TYPE_CHECKING:
-    from tests.sim.mesh import Mesh, Node
+    from tests.support.mesh import Mesh, Node
 
 QUEUE_DEPTH = 10
 """rmw's default."""

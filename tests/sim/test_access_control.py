@@ -13,7 +13,7 @@ from protos.model.members import ServiceOffer
 from sidecar.core.robot.request.service_catalog import WITHDRAW_AFTER_S
 from sidecar.core.seam.application import CallsForbidden, ExecuteRequest, RequestFailed, WithdrawService
 from tests.sim.joined_planes import JoinedPlanes, restored
-from tests.sim.mesh import SERVICE, TYPE, Mesh, Node, rule
+from tests.support.mesh import SERVICE, TYPE, Mesh, Node, rule
 
 if TYPE_CHECKING:
     from sidecar.core.base.values import RequestId

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from protos.model.ids import Address
-    from tests.sim.mesh import Mesh, Node
+    from tests.support.mesh import Mesh, Node
 
 ELSEWHERE: Address = ("attacker.eth0", 666)
 

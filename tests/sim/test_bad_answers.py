@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from sidecar.core.seam.application import DeadlineMissed, RequestFailed
-from tests.sim.mesh import Mesh, Node, rule
+from tests.support.mesh import Mesh, Node, rule
 
 GARBAGE = b"garbage"
 REQUESTS = 200

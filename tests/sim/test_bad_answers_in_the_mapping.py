@@ -10,7 +10,7 @@ from controlplane.cli.explanation_text import render
 from protos.model.ids import Role
 from sidecar.core.robot.dispatch.penalties import FIRST_S, LONGEST_S
 from tests.sim.joined_planes import JoinedPlanes
-from tests.sim.mesh import SERVICE, Mesh, Node, rule
+from tests.support.mesh import SERVICE, Mesh, Node, rule
 
 if TYPE_CHECKING:
     from protos.model.ids import NodeName

@@ -8,7 +8,7 @@ from statistics import median
 import pytest
 
 from protos.model.ids import Role
-from tests.sim.mesh import Mesh, Node, rule
+from tests.support.mesh import Mesh, Node, rule
 
 MBIT = 1e6 / 8
 ONE_WAY_S = 0.025

@@ -14,8 +14,8 @@ from controlplane.core.publish.messages import CloseReason
 from protos.model.ids import InterfaceName, Role, Version
 from protos.model.members import AT_MOST_EVERY_INTERFACE, CandidateSet, Copies, InterfaceLabel, PeerSet, ServiceSet
 from tests.sim.control_chaos import Chaos
-from tests.sim.control_world import SimSidecar, World
-from tests.unit.controlplane.samples import interfaces, offer, registration, use
+from tests.support.control_world import SimSidecar, World
+from tests.support.samples import interfaces, offer, registration, use
 
 if TYPE_CHECKING:
     from protos.model.mapping import MappingSet

@@ -10,7 +10,7 @@ from sidecar.core.cloud import answers as answers_module
 from sidecar.core.seam.application import RequestFailed
 from sidecar.core.transfer import room as room_module
 from sidecar.core.transfer.room import SMALL_BYTES, Lane
-from tests.sim.mesh import SERVICE, TYPE, Mesh, Node, rule
+from tests.support.mesh import SERVICE, TYPE, Mesh, Node, rule
 
 pytestmark = pytest.mark.audit("dp-1")
 MBIT = 1e6 / 8

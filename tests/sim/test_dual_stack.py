@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from sidecar.core.wire.frame import BASE_BYTES
-from tests.sim.mesh import IPV6, Mesh, Node
+from tests.support.mesh import IPV6, Mesh, Node
 
 if TYPE_CHECKING:
     from protos.model.ids import Address

@@ -13,7 +13,7 @@ from tests.sim.test_sealing import pair
 
 if TYPE_CHECKING:
     from protos.trust.credential import SessionCredential
-    from tests.sim.mesh import Mesh, Node
+    from tests.support.mesh import Mesh, Node
 
 pytestmark = pytest.mark.audit("sec-6")
 

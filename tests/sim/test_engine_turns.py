@@ -17,7 +17,7 @@ from protos.model.redundancy_mode import RedundancyMode
 from sidecar.core.engine.engine import Engine
 from sidecar.core.seam.application import RequestFailed
 from sidecar.core.seam.links import SetCarrier
-from tests.sim.mesh import TYPE, Mesh, Node, rule
+from tests.support.mesh import TYPE, Mesh, Node, rule
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator

@@ -17,8 +17,8 @@ from protos.model.mapping import Assignment
 from protos.model.members import AT_MOST_EVERY_INTERFACE, CandidateSet, InterfaceLabel, ServiceSet
 from protos.model.report import InterfaceJointReport, JointReport, Report
 from protos.model.status import SyncState
-from tests.sim.control_world import SimSidecar, World
-from tests.unit.controlplane.samples import PLAN, histogram, interfaces, latency, offer, path, registration, use
+from tests.support.control_world import SimSidecar, World
+from tests.support.samples import PLAN, histogram, interfaces, latency, offer, path, registration, use
 
 ROBOT = NodeName("robot")
 WLAN, WWAN = InterfaceName("wlan0"), InterfaceName("wwan0")

@@ -10,12 +10,12 @@ from protos.model.ids import Role, ServiceName
 from sidecar.core.robot.fallback.fallbacks import Fallbacks
 from sidecar.core.rules.fallback_rule import FallbackRule
 from sidecar.core.seam.application import DeadlineMissed, RequestFailed, ResponseArrived, Unreachable
-from tests.sim.mesh import SERVICE, Mesh, rule
+from tests.support.mesh import SERVICE, Mesh, rule
 
 if TYPE_CHECKING:
     from sidecar.core.base.values import RequestId
     from sidecar.core.seam.application import ApplicationEvent
-    from tests.sim.mesh import Node
+    from tests.support.mesh import Node
 
 DEADLINE_S = 0.5
 TAKES_S = 0.08

@@ -12,8 +12,8 @@ from protos.model.ids import InterfaceName, NodeName, Role, ServiceName
 from protos.model.mapping import Assignment
 from protos.model.members import CandidateSet, ServiceSet
 from protos.model.report import LatencyReport, Report
-from tests.sim.control_world import World
-from tests.unit.controlplane.samples import histogram, interfaces, latency, offer, registration, use
+from tests.support.control_world import World
+from tests.support.samples import histogram, interfaces, latency, offer, registration, use
 
 pytestmark = pytest.mark.audit("sec-10")
 

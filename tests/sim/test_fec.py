@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from protos.model.ids import Role
-from tests.sim.mesh import Mesh, Node, rule
+from tests.support.mesh import Mesh, Node, rule
 
 if TYPE_CHECKING:
     from collections.abc import Callable

@@ -6,7 +6,7 @@ import pytest
 
 from sidecar.core.link import datagrams
 from sidecar.core.seam.links import LinkCommand, SendFinished
-from tests.sim.mesh import Mesh, rule
+from tests.support.mesh import Mesh, rule
 
 pytestmark = pytest.mark.audit("dp-8")
 

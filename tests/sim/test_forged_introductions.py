@@ -10,12 +10,12 @@ from protos.model.ids import InterfaceId, InterfaceName, NodeName, Role
 from sidecar.core.wire.frame import Header
 from sidecar.core.wire.introduction import encode_introduction
 from tests.sim.joined_planes import JoinedPlanes
-from tests.sim.mesh import Mesh, rule
+from tests.support.mesh import Mesh, rule
 
 if TYPE_CHECKING:
     from protos.model.ids import Address
     from protos.model.members import Peer, PeerSet
-    from tests.sim.mesh import Node
+    from tests.support.mesh import Node
 
 pytestmark = pytest.mark.audit("sec-5")
 

@@ -12,8 +12,8 @@ from protos.model.redundancy_mode import RedundancyMode
 from sidecar.core.base.values import PathState
 from sidecar.core.link.liveness import PathKeeper
 from sidecar.core.path.probing import IDLE_PROBE_S, IDLE_SPREAD, MAX_IDLE_PROBE_S, WATCH_FACTOR
-from tests.sim.mesh import Mesh, Node, rule
 from tests.sim.test_mesh import assert_each_answered_once, mapped, two_by_two
+from tests.support.mesh import Mesh, Node, rule
 
 if TYPE_CHECKING:
     from sidecar.core.link.link import Link

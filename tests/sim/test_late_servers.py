@@ -9,8 +9,8 @@ from protos.model.redundancy_mode import RedundancyMode
 from sidecar.core.base.values import RejectReason
 from sidecar.core.robot.request.service_catalog import WITHDRAW_AFTER_S
 from sidecar.core.seam.application import ApplicationEvent, ExecuteRequest, RequestFailed, WithdrawService
-from tests.sim.mesh import SERVICE, TYPE, Mesh, Node, rule
 from tests.sim.test_mesh import call_at, mapped
+from tests.support.mesh import SERVICE, TYPE, Mesh, Node, rule
 
 SERVERLESS_S = 3.0
 

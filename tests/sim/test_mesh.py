@@ -13,7 +13,7 @@ from protos.model.members import Peer, PeerSet
 from sidecar.core.path.path import DOWN_FLOOR_S
 from sidecar.core.path.probing import FIRST_PROBE_S
 from sidecar.core.seam.application import DeadlineMissed, OfferService, RequestFailed, WithdrawService
-from tests.sim.mesh import SERVICE, Mesh, Node, rule
+from tests.support.mesh import SERVICE, Mesh, Node, rule
 
 
 def two_by_two(seed: int = 1, **rule_changes: object) -> tuple[Mesh, Node, Node, Node]:

@@ -5,8 +5,8 @@ from __future__ import annotations
 from sidecar.core.message.reassembly import MAX_AGE_S
 from sidecar.core.path.pmtu import HEADERS_V4
 from sidecar.core.wire.frame import BASE_BYTES
-from tests.sim.mesh import Mesh, Node, rule
 from tests.sim.test_mesh import mapped, two_by_two
+from tests.support.mesh import Mesh, Node, rule
 
 SIZE = 2_000_000
 BYTES_PER_S = 1_000_000.0

@@ -11,8 +11,8 @@ import pytest
 from protos.model.redundancy_mode import RedundancyMode
 from sidecar.core.rules.budget import Budget
 from tests.sim.joined_planes import JoinedPlanes
-from tests.sim.mesh import SERVICE, Mesh, Node, rule
 from tests.sim.test_redundancy_modes import stall
+from tests.support.mesh import SERVICE, Mesh, Node, rule
 
 if TYPE_CHECKING:
     from controlplane.core.explain.fleet_view import MissView

@@ -16,7 +16,7 @@ from sidecar.core.link.link import Link
 from sidecar.core.path.key_exchange import KeyLimits
 from sidecar.core.seam.links import ResetPaths, SetPeers, SetReady
 from sidecar.core.wire import introduction
-from tests.sim.mesh import Mesh, Node
+from tests.support.mesh import Mesh, Node
 
 if TYPE_CHECKING:
     from protos.model.ids import InterfaceName

@@ -10,9 +10,9 @@ from controlplane.observe.fleet_metrics import families
 from protos.model.ids import NodeName, Role
 from protos.model.members import RemovalReason, ServiceSet
 from protos.model.report import Report
-from tests.sim.control_world import SETTLED_S, SimSidecar, World
-from tests.unit.controlplane.samples import PLAN, offer, path, registration
-from tests.unit.controlplane.scrapes import fleet_of, series, value
+from tests.support.control_world import SETTLED_S, SimSidecar, World
+from tests.support.samples import PLAN, offer, path, registration
+from tests.support.scrapes import fleet_of, series, value
 
 pytestmark = pytest.mark.audit("ops-12")
 

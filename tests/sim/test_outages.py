@@ -7,8 +7,8 @@ import pytest
 from protos.model.ids import NodeName
 from sidecar.core.base.values import PathState
 from sidecar.core.path.probing import FIRST_PROBE_S
-from tests.sim.mesh import Mesh, rule
 from tests.sim.test_mesh import mapped
+from tests.support.mesh import Mesh, rule
 
 SIZE = 120_000
 EVERY_S = 0.2

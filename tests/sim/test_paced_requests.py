@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import pytest
 
 from sidecar.core.path.turn import Turn
-from tests.sim.mesh import Mesh, Node, Wire, rule
+from tests.support.mesh import Mesh, Node, Wire, rule
 
 if TYPE_CHECKING:
     from sidecar.core.base.values import ExecutionId, RequestId

@@ -6,8 +6,8 @@ import pytest
 
 from protos.model.ids import Role
 from protos.model.redundancy_mode import RedundancyMode
-from tests.sim.mesh import Mesh, rule
 from tests.sim.serial_server import SerialServer
+from tests.support.mesh import Mesh, rule
 
 
 @pytest.mark.audit("dp-10")

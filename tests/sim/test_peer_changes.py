@@ -27,7 +27,7 @@ from protos.model.peer_changes import put_together
 from protos.model.status import SyncState
 from protos.model.stream import Drain, ResourceKind, Welcome
 from sidecar.core.control.session import Apply, ControlSession, ControlState
-from tests.unit.controlplane.samples import candidate, offer, registration, use
+from tests.support.samples import candidate, offer, registration, use
 
 if TYPE_CHECKING:
     from controlplane.core.control.events import Event

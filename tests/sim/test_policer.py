@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import pytest
 
 from tests.sim.bottleneck import Bottleneck, OurFlow, Policed
-from tests.sim.mesh import Mesh, rule
+from tests.support.mesh import Mesh, rule
 
 if TYPE_CHECKING:
     from collections.abc import Callable

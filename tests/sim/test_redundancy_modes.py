@@ -12,8 +12,8 @@ from controlplane.core.estimate.estimator import Estimator
 from protos.model.ids import InterfaceName
 from protos.model.redundancy_mode import RedundancyMode
 from sidecar.core.rules.budget import Budget
-from tests.sim.mesh import SERVICE, Mesh, Node, Wire, rule
 from tests.sim.test_mesh import assert_at_most_once, assert_each_answered_once, call_at, mapped
+from tests.support.mesh import SERVICE, Mesh, Node, Wire, rule
 
 DEADLINE_S = 0.2
 SECONDS = 45.0

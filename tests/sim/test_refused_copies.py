@@ -9,7 +9,7 @@ import pytest
 from sidecar.core.base.values import RejectReason
 from sidecar.core.robot.dispatch.dispatcher import MAX_ASKED, MAX_COPIES
 from sidecar.core.seam.application import ApplicationEvent, ExecuteRequest, RequestFailed
-from tests.sim.mesh import Mesh, rule
+from tests.support.mesh import Mesh, rule
 
 
 @pytest.mark.audit("dp-14")

@@ -10,7 +10,7 @@ from protos.model.redundancy_mode import RedundancyMode
 from sidecar.core.base.values import Priority
 from sidecar.core.transfer import room as room_module
 from sidecar.core.transfer.room import SMALL_BYTES, Lane
-from tests.sim.mesh import TYPE, Mesh, rule
+from tests.support.mesh import TYPE, Mesh, rule
 
 SIZE = 400_000
 

@@ -6,7 +6,7 @@ import pytest
 
 from sidecar.core.seam.application import RequestFailed
 from sidecar.core.transfer.room import Lane
-from tests.sim.mesh import SERVICE, Mesh, Node, rule
+from tests.support.mesh import SERVICE, Mesh, Node, rule
 
 pytestmark = pytest.mark.audit("dp-7")
 BYTES_PER_S = 250_000.0

@@ -10,8 +10,8 @@ from controlplane.core.registry.restlessness import BYTES_BURST, BYTES_PER_S
 from protos.model.ids import NodeName, Role
 from protos.model.members import CandidateSet, PeerSet, ServiceSet
 from protos.model.stream import Drain
-from tests.sim.control_world import SimSidecar, World
-from tests.unit.controlplane.samples import candidate, interfaces, offer, registration
+from tests.support.control_world import SimSidecar, World
+from tests.support.samples import candidate, interfaces, offer, registration
 
 pytestmark = pytest.mark.audit("sec-5")
 

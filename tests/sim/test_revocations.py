@@ -19,7 +19,7 @@ from sidecar.core.base.values import Priority
 from sidecar.core.engine.revocation_exchange import ASK_NEXT_AFTER_S, MAX_SENDING_BYTES
 from sidecar.core.seam.links import SetCredential
 from sidecar.core.wire.messages import RevocationLists, RevocationsHeld, RevocationsWanted, encode_message
-from tests.sim.mesh import Mesh, rule
+from tests.support.mesh import Mesh, rule
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from protos.model.ids import NodeName
     from protos.trust.credential import SessionCredential
     from sidecar.core.wire.messages import RevocationMessage
-    from tests.sim.mesh import Node
+    from tests.support.mesh import Node
 
 pytestmark = pytest.mark.audit("sec-12")
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 import pytest
 
 from sidecar.core.seam.application import RequestFailed
-from tests.sim.mesh import rule
 from tests.sim.nat import NatMesh
 from tests.sim.test_mesh import mapped
+from tests.support.mesh import rule
 
 pytestmark = pytest.mark.audit("dp-16")
 

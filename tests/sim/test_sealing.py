@@ -15,9 +15,9 @@ from protos.trust.credential import Aead
 from sidecar.core.path.key_exchange import KeyLimits
 from sidecar.core.wire import frame
 from sidecar.core.wire.introduction import encode_introduction
-from tests.sessions import credential_of
-from tests.sim.mesh import Mesh, Node
 from tests.sim.test_mesh import assert_each_answered_once
+from tests.support.mesh import Mesh, Node
+from tests.support.sessions import credential_of
 
 if TYPE_CHECKING:
     from protos.trust.credential import SessionCredential

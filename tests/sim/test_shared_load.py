@@ -8,7 +8,7 @@ import pytest
 
 from protos.model.ids import InterfaceName, NodeName, Version
 from protos.model.mapping import Assignment, MappingSet, ServiceMapping
-from tests.sim.mesh import SERVICE, Mesh, Node, rule
+from tests.support.mesh import SERVICE, Mesh, Node, rule
 
 if TYPE_CHECKING:
     from sidecar.core.base.values import ExecutionId

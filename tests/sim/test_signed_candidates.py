@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
     from protos.model.ids import Address
     from protos.model.members import Peer
-    from tests.sim.mesh import Mesh, Node
+    from tests.support.mesh import Mesh, Node
 
 pytestmark = pytest.mark.audit("sec-5")
 

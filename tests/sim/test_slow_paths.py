@@ -8,8 +8,8 @@ import pytest
 
 from sidecar.core.base.values import PathState
 from sidecar.core.path.probing import MAX_PROBE_S
-from tests.sim.mesh import Mesh, Node, Wire, rule
 from tests.sim.test_mesh import assert_at_most_once, assert_each_answered_once
+from tests.support.mesh import Mesh, Node, Wire, rule
 
 if TYPE_CHECKING:
     from sidecar.core.path.path import Path

@@ -18,10 +18,10 @@ from sidecar.core.base.values import PathState
 from sidecar.core.crypto.aead import KEY_BYTES, TAG_BYTES, make_cipher
 from sidecar.core.path.key_exchange import KeyLimits
 from sidecar.core.wire.frame import CLEAR, HEADER_BYTES, INTRODUCTION_FLAG, NONCE_OFFSET, decode_header
-from tests.sessions import private_key
-from tests.sim.mesh import Mesh, Node
 from tests.sim.test_mesh import assert_each_answered_once
 from tests.sim.test_sealing import dropped, phases
+from tests.support.mesh import Mesh, Node
+from tests.support.sessions import private_key
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

@@ -18,13 +18,13 @@ from sidecar.core.link.path_table import UNPROVEN_BYTES, UNPROVEN_BYTES_PER_S
 from sidecar.core.path.address import AMPLIFICATION
 from sidecar.core.wire import frame
 from sidecar.core.wire.messages import RequestMessage, encode_message
-from tests.sim.mesh import SERVICE, TYPE, Mesh, rule
+from tests.support.mesh import SERVICE, TYPE, Mesh, rule
 
 if TYPE_CHECKING:
     from protos.model.ids import Address
     from protos.model.members import Peer
     from sidecar.core.path.path import Path
-    from tests.sim.mesh import Node
+    from tests.support.mesh import Node
 
 pytestmark = pytest.mark.audit("sec-5")
 

@@ -11,8 +11,8 @@ from sidecar.core.base.values import Priority
 from sidecar.core.path.pmtu import HEADERS_V4
 from sidecar.core.seam.application import ExecuteRequest
 from sidecar.core.wire.frame import BASE_BYTES
-from tests.sim.mesh import Mesh, Node, Wire, rule
 from tests.sim.serial_server import SerialServer
+from tests.support.mesh import Mesh, Node, Wire, rule
 
 if TYPE_CHECKING:
     from sidecar.core.message.repair import Redundancy

@@ -12,8 +12,8 @@ from controlplane.core.explain.explanation import UnknownNameError
 from controlplane.core.policy.policy import CallRule, OfferRule, Policy
 from protos.model.ids import NodeName, ServiceName
 from protos.model.members import ServiceSet
-from tests.sim.control_world import SETTLED_S, World
-from tests.unit.controlplane.samples import offer, use
+from tests.support.control_world import SETTLED_S, World
+from tests.support.samples import offer, use
 
 if TYPE_CHECKING:
     from controlplane.core.control.events import Event

@@ -14,7 +14,7 @@ from controlplane.__main__ import main as controlplane
 from controlplane.cli import __main__
 from protos.program.command_line import main as plr
 from sidecar.__main__ import main as sidecar
-from tests.free_ports import free_port
+from tests.support.free_ports import free_port
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence

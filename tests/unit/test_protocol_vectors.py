@@ -44,7 +44,7 @@ from sidecar.core.path.keys import LATE_S, MAX_FAILED, PathKeys, make_path_keys
 from sidecar.core.transfer import outbox
 from sidecar.core.wire import fec, frame, introduction, messages
 from sidecar.core.wire.frame import Header
-from tests.sessions import seal
+from tests.support.sessions import seal
 
 if TYPE_CHECKING:
     from collections.abc import Callable

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from tests.sim.control_world import World
+from tests.support.control_world import World
 
 
 @pytest.fixture

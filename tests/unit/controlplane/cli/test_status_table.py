@@ -14,7 +14,7 @@ from protos.model.mapping import Assignment, ServiceMapping
 from protos.model.members import HeldList, Peer, RevocationSet, ServiceOffer
 from protos.model.report import PathReport
 from protos.model.status import ResourceStatus, SidecarStatus, SyncState
-from tests.unit.controlplane.samples import PLAN, histogram, offer, use
+from tests.support.samples import PLAN, histogram, offer, use
 
 SYNCED = ResourceStatus(Version(7), Version(7), SyncState.SYNCED)
 

@@ -41,18 +41,9 @@ from protos.model.members import CandidateSet, InterfaceLabel, RemovalReason, Se
 from protos.model.redundancy_mode import RedundancyMode
 from protos.model.report import OutcomeReport, PathReport, Report
 from protos.model.stream import Drain
-from tests.sim.control_world import SETTLED_S, SimSidecar, World
-from tests.unit.controlplane.samples import (
-    PLAN,
-    histogram,
-    interfaces,
-    latency,
-    offer,
-    path,
-    registration,
-    use,
-)
-from tests.unit.controlplane.scrapes import fleet_of, series, value
+from tests.support.control_world import SETTLED_S, SimSidecar, World
+from tests.support.samples import PLAN, histogram, interfaces, latency, offer, path, registration, use
+from tests.support.scrapes import fleet_of, series, value
 
 pytestmark = pytest.mark.audit("ops-13")
 

@@ -9,8 +9,8 @@ import prometheus_client
 from controlplane.observe.fleet_metrics import REUSED_S, Fleet
 from controlplane.observe.metrics import Metrics
 from protos.model.report import OutcomeReport, Report
-from tests.sim.control_world import World
-from tests.unit.controlplane.samples import PLAN
+from tests.support.control_world import World
+from tests.support.samples import PLAN
 
 
 def text(metrics: Metrics, world: World) -> str:

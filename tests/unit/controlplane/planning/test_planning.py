@@ -24,7 +24,7 @@ from protos.model.explanation import SAMPLE, Belief, Correlation, Explanation, J
 from protos.model.ids import InterfaceName, NodeName, ServiceName
 from protos.model.mapping import Assignment
 from protos.model.status import ResourceStatus
-from tests.unit.controlplane.samples import histogram
+from tests.support.samples import histogram
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -19,7 +19,7 @@ from protos.model.members import PeerSet
 from protos.model.report import Report
 from protos.model.stream import Heartbeat
 from protos.plr.v1 import control_pb2
-from tests.unit.controlplane.samples import registration
+from tests.support.samples import registration
 
 if TYPE_CHECKING:
     from controlplane.loop import ControlLoop

@@ -15,7 +15,7 @@ from controlplane.serve.stream_limits import (
 from protos.convert.reports import report_entries
 from protos.model.ids import NodeName
 from protos.model.report import OutcomeReport, PenaltyReport, Report
-from tests.unit.controlplane.samples import PLAN
+from tests.support.samples import PLAN
 
 
 def test_a_sidecar_that_does_what_it_is_told_is_never_too_fast() -> None:

@@ -20,7 +20,7 @@ from controlplane.solver.matcher import Matcher
 from protos.convert import use_from_proto, use_to_proto
 from protos.model.ids import MAX_VERSION, InterfaceName, NodeName, ServiceName, Version
 from protos.model.members import Copies
-from tests.unit.controlplane.samples import histogram, use
+from tests.support.samples import histogram, use
 
 if TYPE_CHECKING:
     from collections.abc import Mapping

@@ -15,7 +15,7 @@ from protos.convert.message_cost import CHEAP_BYTES, SPARE_FIELDS, check_cost
 from protos.model.report import MAX_LATENCIES, MAX_PATHS, Report
 from protos.model.stream import Heartbeat, SidecarMessage
 from protos.plr.v1 import control_pb2, types_pb2
-from tests.unit.controlplane.samples import histogram, latency, path
+from tests.support.samples import histogram, latency, path
 from tests.unit.protos.message_strategies import sidecar_messages
 
 pytestmark = pytest.mark.audit("ops-16")

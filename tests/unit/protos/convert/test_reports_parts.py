@@ -12,7 +12,7 @@ from protos.model.ids import InterfaceName, NodeName, ServiceName
 from protos.model.report import MAX_PATHS, PenaltyReport, Report
 from protos.model.stream import Heartbeat
 from protos.plr.v1 import control_pb2
-from tests.unit.controlplane.samples import histogram, latency, path
+from tests.support.samples import histogram, latency, path
 
 ROBOT, SERVER, PLAN = NodeName("robot"), NodeName("a"), ServiceName("/plan")
 NAMES = [f"if{number:03d}" for number in range(3 * PART_ENTRIES + 1)]

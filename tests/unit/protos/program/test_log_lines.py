@@ -13,7 +13,7 @@ from protos.base.printable import escaped
 from protos.program.log_lines import JournalFormatter, LineFormatter, is_journal, line_formatter
 from sidecar.core.base.values import RejectReason
 from sidecar.core.wire.messages import RejectionMessage, decode_message, encode_message
-from tests.unit.sidecar.core.builders import request_id
+from tests.support.builders import request_id
 
 if TYPE_CHECKING:
     from pathlib import Path

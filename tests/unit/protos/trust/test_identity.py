@@ -18,7 +18,7 @@ from protos.trust.identity import (
     IdentityRole,
     Trust,
 )
-from tests.unit.protos.forged import CA_USAGE, DAY_S, NOW, Recipe, uri
+from tests.support.forged import CA_USAGE, DAY_S, NOW, Recipe, uri
 
 
 def authority(name: str = "fleet", days: float = 100.0) -> Authority:

@@ -18,7 +18,7 @@ from sidecar.core.seam.stats import EngineStats
 from sidecar.core.transfer.outbox import Outbox
 from sidecar.core.transfer.routes import Routes
 from sidecar.core.wire.messages import CancelMessage, RejectionMessage, ResponseMessage, decode_message
-from tests.unit.sidecar.core.builders import ECHO, TYPE, WLAN, WWAN, A, B, path, peer, request_id
+from tests.support.builders import ECHO, TYPE, WLAN, WWAN, A, B, path, peer, request_id
 
 if TYPE_CHECKING:
     from protos.model.ids import NodeName

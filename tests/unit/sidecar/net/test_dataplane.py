@@ -30,7 +30,7 @@ from sidecar.core.seam.application import ApplicationEvent, ExecuteRequest, Offe
 from sidecar.core.seam.links import SetReady
 from sidecar.net.dataplane import DataPlaneHooks, ThreadedDataPlane
 from sidecar.net.interface_thread import BLOCKED_TIMER_S, InterfaceThread
-from tests.sessions import session_of
+from tests.support.sessions import session_of
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

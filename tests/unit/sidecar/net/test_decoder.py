@@ -21,8 +21,8 @@ from sidecar.core.wire.frame import Fragment
 from sidecar.core.wire.messages import RequestMessage, encode_message
 from sidecar.net.dataplane import DataPlaneHooks, ThreadedDataPlane
 from sidecar.net.decoder import Decoder
-from tests.sessions import session_of
-from tests.unit.sidecar.core.builders import ECHO, TYPE, path, peer, request_id, rule
+from tests.support.builders import ECHO, TYPE, path, peer, request_id, rule
+from tests.support.sessions import session_of
 
 if TYPE_CHECKING:
     from sidecar.core.seam.application import ApplicationEvent

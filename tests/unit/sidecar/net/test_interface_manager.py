@@ -16,7 +16,7 @@ from sidecar.net import interface_manager as module
 from sidecar.net.interface_manager import InterfaceManager
 from sidecar.net.interfaces import Interface
 from sidecar.net.netlink_watch import Changes
-from tests.sessions import session_of
+from tests.support.sessions import session_of
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

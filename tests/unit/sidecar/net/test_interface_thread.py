@@ -10,7 +10,7 @@ from protos.model.ids import InterfaceId, InterfaceName, Role
 from sidecar.core.link.datagrams import Batch, LinkIdentity
 from sidecar.core.link.link import Link
 from sidecar.net.interface_thread import InterfaceThread
-from tests.sessions import credential_of
+from tests.support.sessions import credential_of
 
 if TYPE_CHECKING:
     import pytest

@@ -13,7 +13,7 @@ from sidecar.core.link.link import Link
 from sidecar.core.seam.links import PathChanged
 from sidecar.net.interface_thread import InterfaceThread
 from sidecar.net.sources import Sources
-from tests.sessions import credential_of
+from tests.support.sessions import credential_of
 from tests.unit.sidecar.net.test_interface_thread import Owner
 
 pytestmark = pytest.mark.audit("dp-14")

@@ -12,11 +12,11 @@ from protos.model.members import ServiceSet
 from protos.model.report import OutcomeReport, Report
 from protos.model.status import SyncState
 from protos.model.stream import Heartbeat
-from tests.sim.control_world import SETTLED_S
-from tests.unit.controlplane.samples import PLAN, histogram, interfaces, latency, offer, path, use
+from tests.support.control_world import SETTLED_S
+from tests.support.samples import PLAN, histogram, interfaces, latency, offer, path, use
 
 if TYPE_CHECKING:
-    from tests.sim.control_world import World
+    from tests.support.control_world import World
 
 ROBOT = NodeName("robot")
 

@@ -11,10 +11,10 @@ from protos.model.mapping import MappingSet
 from protos.model.members import PeerSet, RemovalReason
 from protos.model.status import SyncState
 from protos.model.stream import Ack, ResourceKind
-from tests.sim.control_world import SETTLED_S
+from tests.support.control_world import SETTLED_S
 
 if TYPE_CHECKING:
-    from tests.sim.control_world import World
+    from tests.support.control_world import World
 
 
 def test_a_nack_is_shown_and_the_same_content_is_not_sent_again_at_once(world: World) -> None:

@@ -14,11 +14,11 @@ from controlplane.core.publish.publisher import INFORM_S
 from protos.model.mapping import MappingSet
 from protos.model.members import PeerSet
 from protos.model.stream import Heartbeat
-from tests.sim.control_world import SETTLED_S
-from tests.unit.controlplane.samples import path
+from tests.support.control_world import SETTLED_S
+from tests.support.samples import path
 
 if TYPE_CHECKING:
-    from tests.sim.control_world import SimSidecar, World
+    from tests.support.control_world import SimSidecar, World
 
 ROBOTS = 60
 

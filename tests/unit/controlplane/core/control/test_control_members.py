@@ -14,8 +14,8 @@ from protos.model.ids import NodeName, Role
 from protos.model.members import CandidateSet, RemovalReason, ServiceSet
 from protos.model.status import SyncState
 from protos.model.stream import Drain
-from tests.sim.control_world import SETTLED_S, World
-from tests.unit.controlplane.samples import interfaces, offer, registration
+from tests.support.control_world import SETTLED_S, World
+from tests.support.samples import interfaces, offer, registration
 
 
 def test_a_silent_cloud_disappears_with_its_lease(world: World) -> None:

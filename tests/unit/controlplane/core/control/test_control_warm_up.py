@@ -10,8 +10,8 @@ from protos.convert.reports import PART_ENTRIES
 from protos.model.ids import NodeName, Role
 from protos.model.members import CandidateSet, ServiceSet
 from protos.model.report import Report
-from tests.sim.control_world import SimSidecar, World
-from tests.unit.controlplane.samples import interfaces, path, registration, use
+from tests.support.control_world import SimSidecar, World
+from tests.support.samples import interfaces, path, registration, use
 
 ROBOT = NodeName("robot")
 

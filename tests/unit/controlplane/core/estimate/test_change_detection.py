@@ -9,7 +9,7 @@ import pytest
 from controlplane.core.estimate.processing import ComputeTimes
 from protos.base.histogram import Histogram
 from protos.model.ids import NodeName
-from tests.unit.controlplane.samples import PLAN, histogram
+from tests.support.samples import PLAN, histogram
 
 A, B, C = (NodeName(name) for name in "abc")
 ROBOT = NodeName("robot")

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from controlplane.core.estimate.distribution import Distribution
 from controlplane.core.estimate.fading import FadedHistogram
-from tests.unit.controlplane.samples import histogram
+from tests.support.samples import histogram
 
 values = st.lists(st.floats(0.0, 100.0), min_size=1, max_size=20)
 

@@ -14,7 +14,7 @@ from controlplane.core.estimate.estimator import LIVE_S, Estimator
 from protos.model.ids import InterfaceName, NodeName, ServiceName
 from protos.model.mapping import Assignment
 from protos.model.report import InterfaceJointReport, JointReport, LatencyReport, OutcomeReport, PathReport, Report
-from tests.unit.controlplane.samples import PLAN, histogram, latency, path
+from tests.support.samples import PLAN, histogram, latency, path
 
 if TYPE_CHECKING:
     from controlplane.core.estimate.posterior import Estimate

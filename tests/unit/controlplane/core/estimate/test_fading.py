@@ -12,7 +12,7 @@ from controlplane.core.estimate.fading import FadedCount, FadedHistogram, FadedS
 from protos.base.histogram import MAX_COUNT, Histogram
 from protos.base.size_class import SIZE_CLASSES
 from protos.model.explanation import SAMPLE
-from tests.unit.controlplane.samples import histogram
+from tests.support.samples import histogram
 
 HALF_LIFE_S = 60.0
 

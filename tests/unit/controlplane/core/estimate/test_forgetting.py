@@ -14,7 +14,7 @@ from controlplane.core.registry.registry import Refusal
 from protos.model.ids import InterfaceName, NodeName, Role, ServiceName
 from protos.model.members import CandidateSet, ServiceSet
 from protos.model.report import OutcomeReport, Report
-from tests.unit.controlplane.samples import PLAN, histogram, interfaces, latency, offer, path, registration, use
+from tests.support.samples import PLAN, histogram, interfaces, latency, offer, path, registration, use
 
 pytestmark = pytest.mark.audit("ops-24h")
 

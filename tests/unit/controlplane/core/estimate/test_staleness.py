@@ -7,7 +7,7 @@ import pytest
 from controlplane.core.estimate.fading import FadedHistogram
 from controlplane.core.estimate.posterior import Estimate, FadedTrials
 from controlplane.core.estimate.staleness import GRACE_S, HALF_LIFE_S, LONGEST_GAP_S, HeardClock, Silence
-from tests.unit.controlplane.samples import histogram
+from tests.support.samples import histogram
 
 STEP_S = 0.5
 FOREVER_S = 1e9

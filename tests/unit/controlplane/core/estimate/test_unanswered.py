@@ -7,7 +7,7 @@ import pytest
 from controlplane.core.estimate.unanswered import LATELY_S, MAX_ANSWERED, MAX_WORDS_OF_ROBOT, REMEMBERED_S, Unanswered
 from protos.base.histogram import MAX_COUNT, Histogram
 from protos.model.ids import NodeName
-from tests.unit.controlplane.samples import PLAN, histogram, latency
+from tests.support.samples import PLAN, histogram, latency
 
 pytestmark = pytest.mark.audit("ops-12")
 

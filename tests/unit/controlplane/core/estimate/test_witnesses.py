@@ -13,7 +13,7 @@ from controlplane.core.estimate.processing import ComputeTimes
 from controlplane.core.estimate.witnesses import COUNTS_ANYWAY, MAX_WITNESSES, MOST_ALONE, Witnesses, thinned
 from protos.base.histogram import BUCKETS, MAX_COUNT, Histogram
 from protos.model.ids import NodeName
-from tests.unit.controlplane.samples import PLAN, histogram
+from tests.support.samples import PLAN, histogram
 
 if TYPE_CHECKING:
     from collections.abc import Iterable

@@ -16,8 +16,8 @@ from protos.model.ids import NodeName, Role
 from protos.model.members import RemovalReason
 from protos.model.report import OutcomeReport, Report
 from protos.model.stream import Drain
-from tests.sim.control_world import SETTLED_S, SimSidecar, World
-from tests.unit.controlplane.samples import PLAN, histogram, latency, path
+from tests.support.control_world import SETTLED_S, SimSidecar, World
+from tests.support.samples import PLAN, histogram, latency, path
 
 pytestmark = pytest.mark.audit("ops-11")
 

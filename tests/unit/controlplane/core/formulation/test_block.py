@@ -21,7 +21,7 @@ from protos.model.ids import InterfaceName, NodeName, Role, ServiceName
 from protos.model.mapping import Assignment
 from protos.model.members import Candidate, Copies, InterfaceLabel, ServiceOffer, ServiceSet, ServiceUse
 from protos.model.report import JointReport, PathReport, PenaltyReport, Report
-from tests.unit.controlplane.samples import (
+from tests.support.samples import (
     PLAN,
     candidate,
     histogram,

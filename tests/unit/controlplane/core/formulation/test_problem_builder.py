@@ -33,7 +33,7 @@ from controlplane.core.registry.registry import Sidecar
 from protos.model.ids import InterfaceName, NodeName, Role, ServiceName
 from protos.model.members import InterfaceLabel, ServiceSet
 from protos.model.report import Report
-from tests.unit.controlplane.samples import PLAN, histogram, interfaces, latency, offer, path, registration, stream, use
+from tests.support.samples import PLAN, histogram, interfaces, latency, offer, path, registration, stream, use
 
 if TYPE_CHECKING:
     from collections.abc import Mapping

@@ -10,7 +10,7 @@ from controlplane.core.base import member_table
 from controlplane.core.overload.registration_share import RETURN_COST, STARTS_BURST, STARTS_PER_S, RegistrationShare
 from controlplane.core.registry.registry import Admission, Refusal, Registry
 from protos.model.ids import NodeName, Role
-from tests.unit.controlplane.samples import registration, stream
+from tests.support.samples import registration, stream
 
 if TYPE_CHECKING:
     from collections.abc import Callable

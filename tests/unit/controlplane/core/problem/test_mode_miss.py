@@ -24,7 +24,7 @@ from controlplane.core.problem.objectives import joint_miss
 from controlplane.core.problem.problem import Block, BlockKey
 from protos.model.ids import InterfaceName, NodeName
 from protos.model.redundancy_mode import RedundancyMode
-from tests.unit.controlplane.samples import PLAN, use
+from tests.support.samples import PLAN, use
 
 pytestmark = pytest.mark.audit("ops-12")
 

@@ -9,7 +9,7 @@ from controlplane.core.publish import history as mapping_history
 from controlplane.core.publish.history import MAX_CHANGES, MappingHistory
 from protos.model.ids import InterfaceName, NodeName, Version
 from protos.model.mapping import Assignment, MappingSet, ServiceMapping
-from tests.unit.controlplane.samples import PLAN
+from tests.support.samples import PLAN
 
 if TYPE_CHECKING:
     import pytest

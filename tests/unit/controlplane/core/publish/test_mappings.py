@@ -14,7 +14,7 @@ from controlplane.core.registry.registry import Sidecar
 from protos.model.ids import InterfaceName, NodeName, ServiceName
 from protos.model.mapping import Assignment, ServiceMapping
 from protos.model.members import ALL_CALLS, CallPermit, Copies, ServiceSet, ServiceUse
-from tests.unit.controlplane.samples import PLAN, interfaces, registration, stream, use
+from tests.support.samples import PLAN, interfaces, registration, stream, use
 
 KEY = BlockKey(NodeName("robot"), PLAN)
 A, B, C = NodeName("a"), NodeName("b"), NodeName("c")

@@ -8,7 +8,7 @@ from controlplane.core.publish.told_peers import ToldPeers
 from protos.model.ids import NodeName, Role, SessionId
 from protos.model.members import ALL_CALLS, Peer
 from protos.trust.pair_token import pair_token
-from tests.unit.controlplane.samples import interfaces, offer
+from tests.support.samples import interfaces, offer
 
 ROBOT = NodeName("robot")
 PEER = Peer(

@@ -12,8 +12,8 @@ from controlplane.core.publish.views import KnownPeers, Views
 from controlplane.core.registry.registry import Registry, Sidecar
 from protos.model.ids import NodeName, Role, ServiceName
 from protos.model.members import ALL_CALLS, CallPermit, CandidateSet, RemovalReason, RemovedPeer, ServiceSet
+from tests.support.samples import interfaces, offer, registration, stream
 from tests.unit.controlplane.policies import CLOUDS, ROBOTS, SERVICES, policies
-from tests.unit.controlplane.samples import interfaces, offer, registration, stream
 
 A, B, C = NodeName("a"), NodeName("b"), NodeName("c")
 ROBOT = NodeName("robot")

@@ -13,7 +13,7 @@ from controlplane.core.registry.registry import Refusal
 from protos.model.ids import NodeName, Role
 from protos.trust.credential import Aead, SessionCredential, session_number
 from protos.trust.identity import Identity, IdentityRole, Trust
-from tests.unit.controlplane.samples import registration as sample
+from tests.support.samples import registration as sample
 
 if TYPE_CHECKING:
     from protos.model.members import Registration

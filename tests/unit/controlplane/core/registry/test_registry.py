@@ -11,7 +11,7 @@ from controlplane.core.registry import registry as registry_module
 from controlplane.core.registry.registry import MAX_POSTPONED, POSTPONE_S, Admission, Refusal, Registry
 from protos.model.ids import NodeName, Role
 from protos.model.members import CandidateSet, RemovalReason, ServiceSet
-from tests.unit.controlplane.samples import interfaces, offer, registration, stream
+from tests.support.samples import interfaces, offer, registration, stream
 
 ROBOT = NodeName("robot")
 LEASE_S = 5.0

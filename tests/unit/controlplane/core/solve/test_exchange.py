@@ -10,7 +10,7 @@ from controlplane.core.solve.exchange import trade
 from controlplane.core.solve.incumbent import Standing
 from controlplane.core.solve.limits import Limits
 from protos.model.ids import InterfaceName, NodeName
-from tests.unit.controlplane.samples import PLAN
+from tests.support.samples import PLAN
 
 SERVERS = tuple(NodeName(name) for name in "abc")
 

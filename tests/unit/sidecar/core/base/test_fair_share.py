@@ -4,7 +4,7 @@ import pytest
 
 from protos.model.ids import NodeName
 from sidecar.core.base.fair_share import Shares
-from tests.unit.sidecar.core.builders import A, B
+from tests.support.builders import A, B
 
 
 def fill(shares: Shares, peer: NodeName) -> int:

@@ -8,7 +8,7 @@ import pytest
 
 from sidecar.core.base.slices import SLICE, Backlog
 from sidecar.core.seam.application import RequestFailed
-from tests.sim.mesh import Mesh, rule
+from tests.support.mesh import Mesh, rule
 
 pytestmark = pytest.mark.audit("dp-10")
 

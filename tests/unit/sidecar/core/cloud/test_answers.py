@@ -19,7 +19,7 @@ from sidecar.core.transfer.outbox import Outbox
 from sidecar.core.transfer.room import SMALL_ROOM_BYTES
 from sidecar.core.transfer.routes import Routes
 from sidecar.core.wire.messages import RejectionMessage, ResponseMessage, decode_message
-from tests.unit.sidecar.core.builders import ECHO, path, request_id, rule
+from tests.support.builders import ECHO, path, request_id, rule
 
 if TYPE_CHECKING:
     from sidecar.core.base.values import PathId

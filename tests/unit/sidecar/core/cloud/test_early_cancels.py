@@ -6,7 +6,7 @@ from protos.model.ids import NodeName
 from sidecar.core.base.fair_share import FORGOTTEN_AT_ONCE
 from sidecar.core.cloud.early_cancels import MAX_EARLY_CANCELS, REMEMBER_CANCEL_S, EarlyCancels
 from sidecar.core.seam.stats import EngineStats
-from tests.unit.sidecar.core.builders import request_id
+from tests.support.builders import request_id
 
 ROBOT, OTHER = NodeName("robot"), NodeName("other")
 

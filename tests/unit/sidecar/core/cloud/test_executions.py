@@ -24,7 +24,7 @@ from sidecar.core.rules.service_rule import MAX_LIFETIME_S
 from sidecar.core.seam.application import AbandonExecution, CancelExecution, ExecuteRequest
 from sidecar.core.seam.stats import EngineStats
 from sidecar.core.wire.messages import MAX_PAYLOAD_BYTES, RejectionMessage, RequestMessage, ResponseMessage
-from tests.unit.sidecar.core.builders import ECHO, path, request
+from tests.support.builders import ECHO, path, request
 
 ROBOT = path(peer="robot")
 ROBOT_2ND = path(peer="robot", remote=1)

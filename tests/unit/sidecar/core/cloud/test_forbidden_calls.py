@@ -15,7 +15,7 @@ from sidecar.core.seam.stats import EngineStats
 from sidecar.core.transfer.outbox import Outbox
 from sidecar.core.transfer.routes import Routes
 from sidecar.core.wire.messages import RejectionMessage, ResponseMessage, decode_message
-from tests.unit.sidecar.core.builders import ECHO, TYPE, WLAN, path, request, rule
+from tests.support.builders import ECHO, TYPE, WLAN, path, request, rule
 
 if TYPE_CHECKING:
     from sidecar.core.wire.messages import Message

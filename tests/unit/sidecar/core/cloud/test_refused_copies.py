@@ -11,7 +11,7 @@ from sidecar.core.cloud.executions import MIN_REMEMBER_S, Reply, Waiter
 from sidecar.core.cloud.refused_copies import RefusedCopies, RefusedCopy
 from sidecar.core.seam.stats import EngineStats
 from sidecar.core.wire.messages import RejectionMessage
-from tests.unit.sidecar.core.builders import request, request_id
+from tests.support.builders import request, request_id
 from tests.unit.sidecar.core.cloud.test_executions import ROBOT, ROBOT_2ND, run, table
 
 

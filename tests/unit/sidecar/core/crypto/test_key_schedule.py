@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 from protos.model.ids import InterfaceId, NodeName, Role, SessionId
 from protos.trust.credential import Aead, SessionCredential
 from sidecar.core.crypto.key_schedule import PairKeys, next_root, pair_keys, proof
-from tests.sessions import session_of, with_credential
-from tests.unit.sidecar.core.builders import peer
+from tests.support.builders import peer
+from tests.support.sessions import session_of, with_credential
 
 OURS, THEIRS = (X25519PrivateKey.from_private_bytes(bytes([number]) * 32) for number in (1, 2))
 ROBOT = SessionCredential(NodeName("robot-1"), Role.ROBOT, SessionId(1), 2, bytes(range(32)), Aead.AES_256_GCM)

@@ -10,8 +10,8 @@ from protos.model.ids import NodeName, Role, SessionId
 from protos.trust.credential import SessionCredential, decode_credential
 from sidecar.core.crypto import session as session_module
 from sidecar.core.crypto.session import OwnSession
-from tests.sessions import credential_of, private_key, session_of
-from tests.unit.sidecar.core.builders import A, B, peer
+from tests.support.builders import A, B, peer
+from tests.support.sessions import credential_of, private_key, session_of
 
 if TYPE_CHECKING:
     from protos.model.members import Peer

@@ -11,8 +11,8 @@ from sidecar.core.robot.request.service_catalog import WITHDRAW_AFTER_S
 from sidecar.core.seam.application import CancelExecution, ResponseArrived, WithdrawService
 from sidecar.core.seam.links import FragmentsLost, PeerClosed, PeerRestarted, Resend, SetPeers
 from sidecar.core.wire.messages import ResponseMessage
-from tests.sessions import credential_of
-from tests.unit.sidecar.core.builders import ECHO, A, peer, request, request_id
+from tests.support.builders import ECHO, A, peer, request, request_id
+from tests.support.sessions import credential_of
 from tests.unit.sidecar.core.engine.test_engine import ROBOT, Sidecar, cloud, robot
 
 

@@ -19,8 +19,8 @@ from sidecar.core.engine import announced as module
 from sidecar.core.engine.announced import Announced
 from sidecar.core.engine.peers import Peers
 from sidecar.state.start_session import start_session
-from tests.sessions import session_of
-from tests.unit.sidecar.core.builders import peer
+from tests.support.builders import peer
+from tests.support.sessions import session_of
 from tests.unit.sidecar.state.test_start_session import Fleet
 
 if TYPE_CHECKING:

@@ -44,20 +44,8 @@ from sidecar.core.wire.messages import (
     decode_message,
     encode_message,
 )
-from tests.sessions import credential_of, session_of
-from tests.unit.sidecar.core.builders import (
-    ECHO,
-    TYPE,
-    WLAN,
-    WWAN,
-    A,
-    B,
-    path,
-    peer,
-    request,
-    request_id,
-    rule,
-)
+from tests.support.builders import ECHO, TYPE, WLAN, WWAN, A, B, path, peer, request, request_id, rule
+from tests.support.sessions import credential_of, session_of
 
 ROBOT = NodeName("robot")
 

@@ -26,8 +26,8 @@ from protos.trust.identity import MALFORMED, NOT_YET_VALID, UNTRUSTED, Certifica
 from sidecar.core.crypto.session import OwnSession
 from sidecar.core.engine.peers import RESTART_GAP_S, Peers
 from sidecar.core.seam.links import PeerRestarted
-from tests.sessions import credential_of, private_key, session_of, with_credential
-from tests.unit.sidecar.core.builders import ECHO, A, B, peer
+from tests.support.builders import ECHO, A, B, peer
+from tests.support.sessions import credential_of, private_key, session_of, with_credential
 
 if TYPE_CHECKING:
     from protos.trust.credential import SessionCredential

@@ -19,8 +19,8 @@ from sidecar.core.crypto.session import OwnSession
 from sidecar.core.engine.peers import Peers
 from sidecar.core.engine.verification_budget import ALL_LOOKS_AT_ONCE, ALL_LOOKS_PER_S, LOOKS_AT_ONCE, LOOKS_PER_S
 from sidecar.core.seam.links import PeerRenewed, PeerRestarted
-from tests.sessions import credential_of, private_key
-from tests.unit.sidecar.core.builders import A, B, peer
+from tests.support.builders import A, B, peer
+from tests.support.sessions import credential_of, private_key
 
 if TYPE_CHECKING:
     from collections.abc import Callable

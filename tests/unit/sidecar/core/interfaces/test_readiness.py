@@ -1,7 +1,7 @@
 from __future__ import annotations
 
 from sidecar.core.interfaces.readiness import STUN_GRACE_S, Readiness
-from tests.unit.sidecar.core.builders import WLAN, WWAN
+from tests.support.builders import WLAN, WWAN
 
 BOTH = frozenset({4, 6})
 LATE = 1.0 + STUN_GRACE_S

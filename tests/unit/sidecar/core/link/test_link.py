@@ -28,8 +28,7 @@ from sidecar.core.seam.links import (
 from sidecar.core.wire import frame
 from sidecar.core.wire.frame import Probe, ProbeReply
 from sidecar.core.wire.introduction import Introduction
-from tests.sessions import credential_of
-from tests.unit.sidecar.core.builders import (
+from tests.support.builders import (
     FIRST,
     OUR_INCARNATION,
     OUR_NAME,
@@ -41,6 +40,7 @@ from tests.unit.sidecar.core.builders import (
     Bench,
     message,
 )
+from tests.support.sessions import credential_of
 
 PATH = PathId(WLAN, A, InterfaceId(0))
 OTHER_SESSION = SessionId(99)

@@ -6,7 +6,7 @@ from sidecar.core.link.link import MAX_FINISHED_DELAY_S
 from sidecar.core.seam.links import FragmentsLost, Send, SendFinished
 from sidecar.core.wire import frame
 from sidecar.core.wire.frame import BASE_SYMBOL_BYTES, AckFrame, Finished, Fragment
-from tests.unit.sidecar.core.builders import message
+from tests.support.builders import message
 from tests.unit.sidecar.core.link.test_link import PATH, fragment, numbers, up
 
 

@@ -15,12 +15,7 @@ from sidecar.core.seam.links import PathChanged, SetCredential
 from sidecar.core.wire import frame
 from sidecar.core.wire.frame import Probe, ProbeReply
 from sidecar.core.wire.introduction import Introduction
-from tests.unit.sidecar.core.builders import (
-    PEER_ADDRESS,
-    WLAN,
-    A,
-    Bench,
-)
+from tests.support.builders import PEER_ADDRESS, WLAN, A, Bench
 from tests.unit.sidecar.core.link.test_link import (
     ELSEWHERE,
     OUR_CREDENTIAL,

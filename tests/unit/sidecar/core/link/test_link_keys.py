@@ -19,8 +19,8 @@ from sidecar.core.seam.links import LinkPeer, SetMtu, SetPeers, SetReady
 from sidecar.core.wire import frame
 from sidecar.core.wire.frame import BASE_BYTES, Header, KeyAnswer, KeyOffer, Probe, ProbeReply
 from sidecar.core.wire.introduction import encode_introduction
-from tests.sessions import credential_of, seal, session_of
-from tests.unit.sidecar.core.builders import OUR_ID, OUR_TOKEN, PEER_ADDRESS, WLAN, Bench, peer
+from tests.support.builders import OUR_ID, OUR_TOKEN, PEER_ADDRESS, WLAN, Bench, peer
+from tests.support.sessions import credential_of, seal, session_of
 from tests.unit.sidecar.core.link.test_link import PROBE, fragment, up
 
 if TYPE_CHECKING:

@@ -18,11 +18,7 @@ from sidecar.core.seam.links import (
 from sidecar.core.wire import frame
 from sidecar.core.wire.frame import AckFrame, Finished, Fragment
 from sidecar.core.wire.messages import Encoded
-from tests.unit.sidecar.core.builders import (
-    PEER_SESSION,
-    A,
-    message,
-)
+from tests.support.builders import PEER_SESSION, A, message
 from tests.unit.sidecar.core.link.test_link import (
     PATH,
     fragment,

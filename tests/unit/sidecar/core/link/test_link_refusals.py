@@ -12,10 +12,7 @@ from sidecar.core.seam.links import Send
 from sidecar.core.wire import frame
 from sidecar.core.wire.frame import ProbeReply
 from sidecar.core.wire.introduction import Introduction
-from tests.unit.sidecar.core.builders import (
-    Bench,
-    message,
-)
+from tests.support.builders import Bench, message
 from tests.unit.sidecar.core.link.test_link import (
     ELSEWHERE,
     OTHER_SESSION,

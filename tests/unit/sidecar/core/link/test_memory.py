@@ -9,8 +9,8 @@ from sidecar.core.link import memory as link_memory
 from sidecar.core.link.memory import MAX_PATHS_OF_A_PEER, LinkMemory
 from sidecar.core.path.key_exchange import DEFAULT_LIMITS
 from sidecar.core.path.keys import PathKeys, make_path_keys
-from tests.sessions import session_of
-from tests.unit.sidecar.core.builders import peer
+from tests.support.builders import peer
+from tests.support.sessions import session_of
 
 pytestmark = pytest.mark.audit("sec-1")
 

@@ -9,7 +9,7 @@ from sidecar.core.path.pmtu import PROBE_TIMEOUT_S
 from sidecar.core.seam.links import FragmentsLost, PathMtuChanged, Send, SetMtu
 from sidecar.core.wire import frame
 from sidecar.core.wire.frame import BASE_BYTES, Probe, ProbeReply
-from tests.unit.sidecar.core.builders import PEER_ADDRESS, Bench, message, path
+from tests.support.builders import PEER_ADDRESS, Bench, message, path
 from tests.unit.sidecar.core.link.test_link import up
 
 if TYPE_CHECKING:

@@ -11,7 +11,7 @@ from sidecar.core.seam.links import Ping, SetCarrier
 from sidecar.core.wire import frame
 from sidecar.core.wire.frame import BASE_BYTES, Probe, ProbeReply
 from sidecar.core.wire.introduction import Introduction
-from tests.unit.sidecar.core.builders import WLAN, A, Bench
+from tests.support.builders import WLAN, A, Bench
 
 pytestmark = pytest.mark.audit("ops-14")
 

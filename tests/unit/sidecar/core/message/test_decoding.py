@@ -21,7 +21,7 @@ from sidecar.core.wire import fec
 from sidecar.core.wire.fec import MAX_BLOCK, decoding_cost
 from sidecar.core.wire.frame import Fragment, symbol_count
 from sidecar.core.wire.messages import Encoded
-from tests.unit.sidecar.core.builders import WLAN, A, path
+from tests.support.builders import WLAN, A, path
 
 if TYPE_CHECKING:
     from sidecar.core.seam.links import PathCommand

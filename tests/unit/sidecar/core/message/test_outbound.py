@@ -7,7 +7,7 @@ import pytest
 from sidecar.core.message.outbound import OutboundMessage
 from sidecar.core.wire import fec
 from sidecar.core.wire.messages import Encoded
-from tests.unit.sidecar.core.builders import A, message, path
+from tests.support.builders import A, message, path
 
 
 def coded(count: int, repairs: int, *, head: int = 40) -> OutboundMessage:

@@ -19,7 +19,7 @@ from sidecar.core.message.reassembly import (
 )
 from sidecar.core.wire.frame import MAX_MESSAGE_BYTES, Fragment, symbol_count
 from sidecar.core.wire.messages import Encoded
-from tests.unit.sidecar.core.builders import A, path
+from tests.support.builders import A, path
 
 SYMBOL = 256
 

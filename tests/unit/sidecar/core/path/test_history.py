@@ -8,7 +8,7 @@ from protos.model.ids import InterfaceId
 from sidecar.core.base.values import PathId, PathState
 from sidecar.core.path.history import MAX_REMEMBERED, Change, PathHistory
 from sidecar.core.seam.links import PathChanged
-from tests.unit.sidecar.core.builders import WLAN, A
+from tests.support.builders import WLAN, A
 
 pytestmark = pytest.mark.audit("ops-14")
 

@@ -14,8 +14,8 @@ from sidecar.core.crypto.key_schedule import proof_of_offer
 from sidecar.core.path.key_exchange import OTHER_OFFER_AFTER_S, KeyLimits
 from sidecar.core.path.keys import LATE_S, OpeningKeys, PathKeys, make_path_keys
 from sidecar.core.wire.frame import CLEAR, HEADER_BYTES, NONCE_OFFSET, PHASE_FLAG, KeyAnswer, KeyOffer
-from tests.sessions import agree, session_of, with_credential
-from tests.unit.sidecar.core.builders import peer
+from tests.support.builders import peer
+from tests.support.sessions import agree, session_of, with_credential
 
 LIMITS = KeyLimits(datagrams=10, seconds=5.0)
 HEAD = 0xD3010002

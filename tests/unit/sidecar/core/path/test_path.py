@@ -12,8 +12,8 @@ from sidecar.core.path.key_exchange import DEFAULT_LIMITS
 from sidecar.core.path.keys import make_path_keys
 from sidecar.core.path.path import DOWN_FACTOR, DOWN_FLOOR_S, MAX_RTT_SAMPLES, Path
 from sidecar.core.path.probing import FIRST_PROBE_S, IDLE_PROBE_S, MAX_PROBE_S
-from tests.sessions import agree, session_of, with_credential
-from tests.unit.sidecar.core.builders import path, peer
+from tests.support.builders import path, peer
+from tests.support.sessions import agree, session_of, with_credential
 
 RNG = random.Random(1)
 HERE, THERE, ELSEWHERE = ("192.0.2.1", 1), ("192.0.2.2", 2), ("192.0.2.3", 3)

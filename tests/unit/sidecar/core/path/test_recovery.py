@@ -10,7 +10,7 @@ from sidecar.core.path.recovery import PTO_DATAGRAMS, Recovery
 from sidecar.core.path.reordering import PACKET_THRESHOLD
 from sidecar.core.wire import frame
 from sidecar.core.wire.frame import AckFrame
-from tests.unit.sidecar.core.builders import message
+from tests.support.builders import message
 
 if TYPE_CHECKING:
     from sidecar.core.path.in_flight import Sent

@@ -6,7 +6,7 @@ from sidecar.core.path.congestion.rtt import LONGEST_ANSWER_S, RttEstimator
 from sidecar.core.path.in_flight import Sent
 from sidecar.core.path.reordering import MAX_REMEMBERED, PACKET_THRESHOLD, PERSISTS, Reordering
 from sidecar.core.wire.frame import MAX_ACK_RANGES
-from tests.unit.sidecar.core.builders import message
+from tests.support.builders import message
 
 
 def steady() -> RttEstimator:

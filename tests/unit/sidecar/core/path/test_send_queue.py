@@ -8,7 +8,7 @@ from sidecar.core.base.timers import NEVER
 from sidecar.core.base.values import SHARE, Priority
 from sidecar.core.path.send_queue import MAX_RUN, MAX_RUN_BYTES, PURGE_AT, SendQueue
 from sidecar.core.wire.frame import FRAGMENT_OVERHEAD_BYTES
-from tests.unit.sidecar.core.builders import message, path
+from tests.support.builders import message, path
 
 if TYPE_CHECKING:
     from sidecar.core.message.outbound import OutboundMessage

@@ -6,7 +6,7 @@ import pytest
 
 from sidecar.core.base.timers import NEVER
 from sidecar.core.path.turn import PATIENCE, SMALL, Turn
-from tests.unit.sidecar.core.builders import message, path
+from tests.support.builders import message, path
 
 if TYPE_CHECKING:
     from sidecar.core.message.outbound import OutboundMessage

@@ -6,7 +6,7 @@ from sidecar.core.base.values import PathState, Priority
 from sidecar.core.seam.application import DeadlineMissed, RequestFailed, ResponseArrived
 from sidecar.core.seam.links import Send
 from sidecar.core.wire.messages import RequestMessage, decode_message
-from tests.unit.sidecar.core.builders import ECHO, TYPE, WWAN, A, B, request_id
+from tests.support.builders import ECHO, TYPE, WWAN, A, B, request_id
 from tests.unit.sidecar.core.request_table import RACE, WLAN_A, WWAN_B, Table
 
 

@@ -7,7 +7,7 @@ import pytest
 from sidecar.core.base.values import PathState, RejectReason
 from sidecar.core.robot.dispatch.penalties import FIRST_S
 from sidecar.core.seam.application import DeadlineMissed, ResponseArrived
-from tests.unit.sidecar.core.builders import ECHO, A, B, request_id
+from tests.support.builders import ECHO, A, B, request_id
 from tests.unit.sidecar.core.request_table import RACE, WLAN_A, WWAN_B, Table
 
 pytestmark = pytest.mark.audit("sec-2")

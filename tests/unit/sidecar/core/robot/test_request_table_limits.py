@@ -7,7 +7,7 @@ import pytest
 from sidecar.core.base.values import Priority
 from sidecar.core.robot import request_table as requests_module
 from sidecar.core.wire.messages import MAX_PAYLOAD_BYTES, Encoded
-from tests.unit.sidecar.core.builders import ECHO, A, B
+from tests.support.builders import ECHO, A, B
 from tests.unit.sidecar.core.request_table import WLAN_A, WWAN_B, Table
 
 

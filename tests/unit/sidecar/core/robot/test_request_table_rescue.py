@@ -10,7 +10,7 @@ from protos.model.redundancy_mode import RedundancyMode
 from sidecar.core.base.values import PathId, PathState, RejectReason
 from sidecar.core.robot.dispatch.dispatcher import MAX_COPIES
 from sidecar.core.seam.application import ResponseArrived
-from tests.unit.sidecar.core.builders import A, B, request_id
+from tests.support.builders import A, B, request_id
 from tests.unit.sidecar.core.request_table import RACE, SERVERS, WLAN_A, WWAN_B, Table
 
 

@@ -7,7 +7,7 @@ import pytest
 from protos.model.ids import ServiceName
 from sidecar.core.rules.fallback_rule import FallbackRule
 from sidecar.core.rules.service_rule import MAX_FOUND, Rules
-from tests.unit.sidecar.core.builders import rule
+from tests.support.builders import rule
 
 RULES = (rule("/arm/plan"), rule("/arm/*"), rule("/node/get_parameters"), rule("/*"))
 

@@ -12,7 +12,7 @@ from sidecar.core.transfer.room import LARGE_ROOM_BYTES, MAX_MESSAGES, SMALL_BYT
 from sidecar.core.transfer.routes import Routes
 from sidecar.core.wire.frame import BASE_BYTES
 from sidecar.core.wire.messages import Encoded
-from tests.unit.sidecar.core.builders import WLAN, WWAN, A, B, path
+from tests.support.builders import WLAN, WWAN, A, B, path
 
 if TYPE_CHECKING:
     from sidecar.core.base.slices import Step

@@ -3,7 +3,7 @@ from __future__ import annotations
 from sidecar.core.base.values import PathState
 from sidecar.core.transfer.routes import Routes
 from sidecar.core.wire.frame import BASE_BYTES, FRAGMENT_OVERHEAD_BYTES
-from tests.unit.sidecar.core.builders import WLAN, WWAN, A, B, path
+from tests.support.builders import WLAN, WWAN, A, B, path
 
 FAST, SLOW, SHAKY = path(WLAN, A), path(WWAN, A), path(WLAN, A, 1)
 

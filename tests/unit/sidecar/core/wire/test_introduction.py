@@ -18,7 +18,7 @@ from sidecar.core.wire.introduction import (
     open_introduction,
     read_hello_id,
 )
-from tests.sessions import credential_of
+from tests.support.sessions import credential_of
 
 TOKEN, NAME = bytes(range(16)), NodeName("cloud-a")
 HEADER = Header(InterfaceId(1), InterfaceId(2), SessionId(7), 9)

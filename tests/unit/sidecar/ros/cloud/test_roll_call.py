@@ -8,7 +8,7 @@ import pytest
 
 from sidecar.ros.cloud import roll_call
 from sidecar.ros.cloud.roll_call import CALL_S, CALLS_MISSED, RollCall
-from tests.unit.sidecar.ros.participant_messages import endpoint, participant_info
+from tests.support.participant_messages import endpoint, participant_info
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

@@ -12,7 +12,7 @@ from sidecar.ros.graph.node_names import CALL_S, POLL_S, NodeNames
 from sidecar.ros.graph.unknown_nodes import MAX_ENDPOINTS, UNKNOWN_FOR_S
 from sidecar.ros.log_limit import LimitedLog
 from sidecar.ros.stats import BridgeStats
-from tests.unit.sidecar.ros.participant_messages import endpoint, participant_info
+from tests.support.participant_messages import endpoint, participant_info
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

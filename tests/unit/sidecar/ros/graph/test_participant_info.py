@@ -6,7 +6,7 @@ import pytest
 
 from sidecar.ros.errors import RosBridgeError
 from sidecar.ros.graph.participant_info import MAX_INFO_BYTES, MAX_NODES, nodes_of, speaker
-from tests.unit.sidecar.ros.participant_messages import Node, endpoint, participant_info
+from tests.support.participant_messages import Node, endpoint, participant_info
 
 READERS = [endpoint(7, 1), endpoint(7, 2)]
 WRITERS = [endpoint(7, 3), endpoint(7, 4), endpoint(7, 5)]

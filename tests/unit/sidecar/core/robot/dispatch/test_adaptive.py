@@ -10,7 +10,7 @@ from protos.model.redundancy_mode import RedundancyMode
 from sidecar.core.base.values import PathState
 from sidecar.core.robot.dispatch.adaptive import SPREAD, UNFORESEEN, late_probability
 from sidecar.core.rules.budget import Budget
-from tests.unit.sidecar.core.builders import ECHO, WLAN, WWAN, A, B, path
+from tests.support.builders import ECHO, WLAN, WWAN, A, B, path
 from tests.unit.sidecar.core.request_table import RACE, WLAN_A, WWAN_B, Table
 
 SIZE = 120_000

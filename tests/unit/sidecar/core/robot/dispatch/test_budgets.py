@@ -9,7 +9,7 @@ import pytest
 from sidecar.core.robot.dispatch.budgets import DAY_S, MAX_SAVED_BYTES, Budgets
 from sidecar.core.rules.budget import Budget
 from sidecar.core.seam.stats import EngineStats
-from tests.unit.sidecar.core.builders import ECHO, WLAN, WWAN
+from tests.support.builders import ECHO, WLAN, WWAN
 
 
 def spend(budgets: Budgets, size: int, now: float = 0.0) -> bool:

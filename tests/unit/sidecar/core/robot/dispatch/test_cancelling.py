@@ -7,7 +7,7 @@ import pytest
 from sidecar.core.base.request_id import OBSERVED_ONE_IN
 from sidecar.core.base.values import PathState
 from sidecar.core.robot.dispatch.cancelling import MAX_CALLED_OFF, SMALL_ANSWER_BYTES
-from tests.unit.sidecar.core.builders import ECHO, WLAN, WWAN, A, B, path, request_id
+from tests.support.builders import ECHO, WLAN, WWAN, A, B, path, request_id
 from tests.unit.sidecar.core.request_table import RACE, WLAN_A, WWAN_B, Table
 
 

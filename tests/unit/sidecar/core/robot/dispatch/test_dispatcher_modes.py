@@ -10,7 +10,7 @@ from protos.model.redundancy_mode import RedundancyMode
 from sidecar.core.base.values import PathId, PathState, RejectReason
 from sidecar.core.robot.request.request import HEDGE_AT
 from sidecar.core.rules.budget import Budget
-from tests.unit.sidecar.core.builders import ECHO, WLAN, WWAN, A, B, path
+from tests.support.builders import ECHO, WLAN, WWAN, A, B, path
 from tests.unit.sidecar.core.request_table import RACE, WLAN_A, WWAN_B, Table
 
 WWAN_A = path(WWAN, A)

@@ -19,7 +19,7 @@ from sidecar.core.robot.dispatch.exploration import (
     MIN_INTERVAL_S,
     ExplorationBudget,
 )
-from tests.unit.sidecar.core.builders import ECHO, TYPE, WLAN, WWAN, A, B, path
+from tests.support.builders import ECHO, TYPE, WLAN, WWAN, A, B, path
 from tests.unit.sidecar.core.request_table import RACE, WLAN_A, WWAN_B, Table
 
 WLAN_B = path(WLAN, B)

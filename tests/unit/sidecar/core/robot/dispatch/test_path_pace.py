@@ -9,7 +9,7 @@ from sidecar.core.robot.dispatch import path_pace
 from sidecar.core.robot.dispatch.path_pace import FADE_S, PathPaces
 from sidecar.core.seam.stats import EngineStats
 from sidecar.core.transfer.routes import Routes
-from tests.unit.sidecar.core.builders import ECHO, WLAN, WWAN, A, B, path
+from tests.support.builders import ECHO, WLAN, WWAN, A, B, path
 
 WLAN_A, WWAN_B = path(WLAN, A), path(WWAN, B)
 

@@ -14,7 +14,7 @@ from sidecar.core.robot.fallback.fallbacks import Accepted, Fallbacks
 from sidecar.core.rules.fallback_rule import FallbackRule
 from sidecar.core.rules.service_rule import ServiceRule
 from sidecar.core.seam.application import RequestFailed
-from tests.unit.sidecar.core.builders import request_id
+from tests.support.builders import request_id
 
 if TYPE_CHECKING:
     from sidecar.core.base.values import RequestId

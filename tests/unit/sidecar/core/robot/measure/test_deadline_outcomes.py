@@ -12,7 +12,7 @@ from sidecar.core.robot.measure.measurements import Measurements
 from sidecar.core.robot.request.request import Copy, CopyState, Request
 from sidecar.core.rules.service_rule import ServiceRule
 from sidecar.core.transfer.routes import Routes
-from tests.unit.sidecar.core.builders import ECHO, TYPE, WLAN, WWAN, A, B, path, request_id
+from tests.support.builders import ECHO, TYPE, WLAN, WWAN, A, B, path, request_id
 
 if TYPE_CHECKING:
     from protos.model.report import Report

@@ -17,7 +17,7 @@ from sidecar.core.robot.measure.measurements import Measurements
 from sidecar.core.robot.request.request import Carried
 from sidecar.core.seam.links import PathMeasured
 from sidecar.core.transfer.routes import Routes
-from tests.unit.sidecar.core.builders import ECHO, WLAN, WWAN, A, B, path
+from tests.support.builders import ECHO, WLAN, WWAN, A, B, path
 
 ON_WLAN, ON_WWAN = Carried(WLAN, A, ECHO, 0), Carried(WWAN, A, ECHO, 3)
 

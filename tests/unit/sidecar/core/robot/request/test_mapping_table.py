@@ -5,7 +5,7 @@ from protos.model.mapping import Assignment, MappingSet, ServiceMapping
 from sidecar.core.base.values import PathId, PathState
 from sidecar.core.robot.request.mapping_table import MappingTable
 from sidecar.core.transfer.routes import Routes
-from tests.unit.sidecar.core.builders import ECHO, WLAN, WWAN, A, B, path
+from tests.support.builders import ECHO, WLAN, WWAN, A, B, path
 
 WLAN_A, WLAN_B, WWAN_A, WWAN_B = path(WLAN, A), path(WLAN, B), path(WWAN, A), path(WWAN, B)
 UP, UNSTABLE, DOWN = PathState.UP, PathState.UNSTABLE, PathState.DOWN

@@ -14,7 +14,7 @@ from sidecar.core.rules.service_rule import Rules
 from sidecar.core.seam.application import OfferService, WithdrawService
 from sidecar.core.seam.stats import EngineStats
 from sidecar.core.transfer.routes import Routes
-from tests.unit.sidecar.core.builders import ECHO, TYPE, A, B, path, peer, rule
+from tests.support.builders import ECHO, TYPE, A, B, path, peer, rule
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

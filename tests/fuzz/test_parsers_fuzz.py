@@ -32,7 +32,7 @@ from protos.model.ids import NodeName
 from protos.plr.v1 import admin_pb2
 from sidecar.state import file
 from sidecar.state.file import LastGood
-from tests.fuzz.test_fuzz_state_file import sealed
+from tests.fuzz.test_state_file_fuzz import sealed
 from tests.unit.protos import message_strategies as some
 
 if TYPE_CHECKING:

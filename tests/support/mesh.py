@@ -23,7 +23,7 @@ from sidecar.core.path.pmtu import HEADERS_V4
 from sidecar.core.rules.service_rule import ServiceRule
 from sidecar.core.seam.application import ApplicationEvent, ExecuteRequest, ResponseArrived
 from sidecar.core.seam.links import SetReady
-from tests.sessions import session_of
+from tests.support.sessions import session_of
 
 if TYPE_CHECKING:
     from collections.abc import Callable

@@ -32,7 +32,7 @@ from sidecar.core.wire.frame import (
 )
 from sidecar.core.wire.introduction import Introduction, encode_introduction, open_introduction
 from sidecar.core.wire.messages import Encoded, RequestMessage
-from tests.sessions import agree, credential_of, seal, session_of, with_credential
+from tests.support.sessions import agree, credential_of, seal, session_of, with_credential
 
 if TYPE_CHECKING:
     from collections.abc import Iterable

@@ -15,7 +15,7 @@ from protos.model.mapping import MappingSet, ServiceMapping
 from protos.model.members import CandidateSet, Peer, PeerSet, Registration, RemovalReason, ServiceSet
 from protos.model.report import PathReport, Report
 from protos.model.stream import Ack, ControlMessage, Drain, Heartbeat, Nack, ResourceKind, SidecarMessage, Welcome
-from tests.unit.controlplane.samples import interfaces, offer, path, registration, use
+from tests.support.samples import interfaces, offer, path, registration, use
 
 if TYPE_CHECKING:
     from collections.abc import Callable

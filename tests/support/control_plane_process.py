@@ -23,7 +23,7 @@ from protos.model.stream import Ack, ControlMessage, Drain, Heartbeat, Nack, Res
 from protos.plr.v1 import admin_pb2, admin_pb2_grpc, control_pb2, control_pb2_grpc
 from protos.trust.credential import Aead, SessionCredential, session_number
 from protos.trust.identity import CONTROL_PLANE_DNS
-from tests.unit.controlplane.samples import interfaces, offer, registration, use
+from tests.support.samples import interfaces, offer, registration, use
 
 if TYPE_CHECKING:
     from collections.abc import Callable

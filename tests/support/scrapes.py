@@ -12,7 +12,7 @@ if TYPE_CHECKING:
 
     from prometheus_client import Metric
 
-    from tests.sim.control_world import World
+    from tests.support.control_world import World
 
     Series = dict[tuple[str, tuple[tuple[str, str], ...]], float]
 

@@ -17,7 +17,7 @@ from lab.attacker.junk import flipped, headed, mangled, noise
 from protos.model.ids import InterfaceName
 from sidecar.core.wire.frame import HEADER_BYTES
 from tests.fuzz.test_engine_fuzz import ATTACKS, Rogue, arena, assert_bounded
-from tests.sim.mesh import Mesh, Node
+from tests.support.mesh import Mesh, Node
 
 if TYPE_CHECKING:
     from protos.model.ids import Address

@@ -23,10 +23,10 @@ from protos.model.members import CandidateSet, ServiceSet
 from protos.model.report import Report
 from protos.model.stream import Drain, Heartbeat
 from protos.trust.identity import CONTROL_PLANE_DNS, IdentityRole
-from tests.attacks.registrations import registration
-from tests.integration.control_plane_process import Secured, cloud, open_channel, robot
-from tests.integration.secured_control_plane import SecuredControlPlane
-from tests.unit.controlplane.samples import histogram, interfaces, latency, offer, path, use
+from tests.support.control_plane_process import Secured, cloud, open_channel, robot
+from tests.support.registrations import registration
+from tests.support.samples import histogram, interfaces, latency, offer, path, use
+from tests.support.secured_control_plane import SecuredControlPlane
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

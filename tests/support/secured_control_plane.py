@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from controlplane.ca import Authority
 from protos.trust.identity import IdentityRole
-from tests.integration.control_plane_process import PATIENCE_S, ControlPlaneProcess, Secured
+from tests.support.control_plane_process import PATIENCE_S, ControlPlaneProcess, Secured
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
