@@ -126,7 +126,7 @@ def test_status_as_a_table_and_as_json(plane: ControlPlaneProcess) -> None:
 def test_plr_status_imports_only_what_it_needs(plane: ControlPlaneProcess) -> None:
     """Names, not times: what is imported takes most of the time that the command takes."""
     program = (
-        "import sys; from controlplane.cli import main;"
+        "import sys; from controlplane.cli.__main__ import main;"
         f"code = main(['status', '--insecure', '--address', {plane.address!r}, '--timeout-s', '30']);"
         "print('IMPORTED', *sys.modules); sys.exit(code)"
     )

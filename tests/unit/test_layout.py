@@ -47,18 +47,16 @@ def sources() -> list[Path]:
     return [path for path in found if "plr" not in path.parts]
 
 
-def tested(test: Path, modules: set[Path]) -> Path | None:
+def subject(test: Path, modules: set[Path]) -> Path | None:
     """The module, or the package, that a test file is named after: `test_MODULE.py` or `test_MODULE_ASPECT.py`."""
     folder, name = test.relative_to(UNIT).parent, test.stem.removeprefix("test_")
-    if name == folder.name:
-        return folder
     words = name.split("_")
     for count in range(len(words), 0, -1):
         stem = "_".join(words[:count])
         for candidate in (folder / f"{stem}.py", folder / f"__{stem}__.py"):
             if candidate in modules:
                 return candidate
-    return None
+    return folder if name == folder.name else None
 
 
 def unit_tests() -> list[Path]:
@@ -67,13 +65,13 @@ def unit_tests() -> list[Path]:
 
 @pytest.mark.parametrize("test", unit_tests(), ids=lambda path: str(path.relative_to(UNIT)))
 def test_a_unit_test_lies_where_its_source_does(test: Path) -> None:
-    assert tested(test, set(sources())), "name it test_MODULE.py or test_MODULE_ASPECT.py, in the folder of MODULE"
+    assert subject(test, set(sources())), "name it test_MODULE.py or test_MODULE_ASPECT.py, in the folder of MODULE"
 
 
 def test_no_further_module_of_a_core_is_without_a_test_of_its_own() -> None:
     modules = set(sources())
     cores = {path for path in modules if path.parts[1] == "core" and path.stem != "__init__"}
-    without = {str(path) for path in cores} - {str(tested(test, modules)) for test in unit_tests()}
+    without = {str(path) for path in cores} - {str(subject(test, modules)) for test in unit_tests()}
     assert without == set(NO_TEST_OF_THEIR_OWN), "this list may only get shorter"
 
 

@@ -189,8 +189,8 @@ def test_a_wheel_names_its_commit_and_licence(checkout: Path) -> None:
     git(checkout, "commit", "--quiet", "--message", "all")
     head = git(checkout, "rev-parse", "--short=12", "HEAD").strip()
     held = content(build(checkout))
-    assert held["protos/commit.txt"] == f"{head}\n"
-    assert not (checkout / "protos/commit.txt").exists(), "it would go on to say so of later commits"
+    assert held["protos/program/commit.txt"] == f"{head}\n"
+    assert not (checkout / "protos/program/commit.txt").exists(), "it would go on to say so of later commits"
     metadata = next(text for name, text in held.items() if name.endswith("/METADATA"))
     assert "\nLicense-Expression: Apache-2.0\n" in metadata
     assert any(name.endswith("/licenses/LICENSE") for name in held)
@@ -201,7 +201,7 @@ def test_without_git_a_wheel_names_no_commit(checkout: Path) -> None:
     # Inside another project's checkout, whose commit is not ours.
     git(checkout.parent, "init", "--quiet")
     git(checkout.parent, "commit", "--quiet", "--allow-empty", "--message", "another")
-    assert "protos/commit.txt" not in content(build(checkout))
+    assert "protos/program/commit.txt" not in content(build(checkout))
 
 
 @pytest.mark.audit("ops-10")

@@ -14,8 +14,8 @@ from controlplane.solver.matcher import Matcher
 from controlplane.core.problem.problem import Problem
 Matcher().solve(Problem(()), time_limit_s=1.0)
 assert "ortools" not in sys.modules and "pandas" not in sys.modules
-from controlplane import solver
-solver.prepare()
+from controlplane.solver import cp_sat
+cp_sat.prepare()
 assert "ortools" in sys.modules
 """
 

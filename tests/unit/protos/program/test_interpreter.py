@@ -9,7 +9,7 @@ import pytest
 
 PROGRAM = """
 import gc, weakref
-from protos import interpreter
+from protos.program import interpreter
 
 class Node:
     pass

@@ -134,7 +134,7 @@ def test_a_type_is_chosen_among_those_whose_servers_live(
     side: Any, monkeypatch: pytest.MonkeyPatch, used: str | None, ended: set[bytes], chosen: str
 ) -> None:
     shown = {"a/srv/Stray": {b"stray": True}, "b/srv/Used": {b"used": True}, "c/srv/Nameless": {b"nameless": False}}
-    monkeypatch.setattr("sidecar.ros.graph.server_endpoints", lambda _node, _service, _name_of, _now: shown)
+    monkeypatch.setattr("sidecar.ros.graph.graph.server_endpoints", lambda _node, _service, _name_of, _now: shown)
     watched: set[bytes] = set()
     side._loop = SimpleNamespace(node=None)
     side._processes = SimpleNamespace(watch=watched.add, has_ended=ended.__contains__)
