@@ -75,7 +75,8 @@ def test_ctrl_c_ends_without_a_trace(how: str, code: int) -> None:
 
 
 def test_no_file_of_ours_gets_the_number_of_a_standard_stream() -> None:
-    code = "import os; from protos.program.endings import ends_quietly; ends_quietly('plr')(lambda: 0)(); os._exit(os.dup(0))"
+    code = "import os; from protos.program.endings import ends_quietly; "
+    code += "ends_quietly('plr')(lambda: 0)(); os._exit(os.dup(0))"
     with subprocess.Popen(
         ["sh", "-c", 'exec "$@" <&- >&- 2>&-', "sh", sys.executable, "-c", code], cwd=ROOT
     ) as program:
