@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
     from pathlib import Path
 
-_EXAMPLE = "docs/results/evaluation.json"
+_EXAMPLE = "docs/develop/results/evaluation.json"
 _FIGURES = tuple(one.name for one in fields(Figures))
 
 

@@ -1,7 +1,7 @@
 """Keeping an evaluation in the repository: its data, its summary, and the figures within README and docs.
 
 A figure stands in a page between `<!-- evaluation: NAME -->` and `<!-- end -->`; `blocks` makes what is between them
-from `docs/results/evaluation.json`. A test makes it again and compares: nobody edits such a figure by hand.
+from `docs/develop/results/evaluation.json`. A test makes it again and compares: nobody edits such a figure by hand.
 """
 
 from __future__ import annotations
@@ -18,9 +18,9 @@ from bench.evaluation.blocks import all_blocks
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-RESULTS = Path("docs/results")
+RESULTS = Path("docs/develop/results")
 DATA, SUMMARY, RECORDS = "evaluation.json", "evaluation.md", "records.tar.xz"
-PAGES = ("README.md", "docs/*.md")
+PAGES = ("README.md", "docs/*/*.md")
 FILES = "files"
 """Key of the data under which each other published file has its hash, so that an edited one is noticed."""
 _BLOCK = re.compile(r"(<!-- evaluation: ([\w-]+) -->\n)(.*?)(<!-- end -->)", re.DOTALL)

@@ -1,7 +1,7 @@
 """Scenarios: what is asked over which two paths, read from the YAML files of a folder.
 
 name: drive              # what it is called, with the seed or the trace's name after it
-case: A                  # case study of docs/evaluation.md
+case: A                  # case study of docs/develop/evaluation.md
 about: one line for people
 duration_s: 120
 traffic: {request_bytes: 120000, answer_bytes: 1000, rate_hz: 5, deadline_ms: 1000, compute_ms: 20}

@@ -1,4 +1,4 @@
-"""By which of their counters the honest programs tell of each attack (docs/metrics.md)."""
+"""By which of their counters the honest programs tell of each attack (docs/operate/metrics.md)."""
 
 from __future__ import annotations
 

@@ -33,7 +33,7 @@ MAX_P99_RATIO = 1.5
 """P99 attacked over P99 undisturbed, of each client."""
 MAX_THIRD_PARTY_RATIO = 3.0
 """Bytes that reach the third party over those that the insiders sent in its name (RFC 9000 section 8.1), beside what
-each honest interface may send to addresses that a peer announces and has not proven (docs/limits.md)."""
+each honest interface may send to addresses that a peer announces and has not proven (docs/operate/limits.md)."""
 UNPROVEN_LINKS = len(ROBOTS) * len(PROFILES) + len(CLOUDS)
 """Honest interfaces, each of which knows one of the insiders."""
 SETTLE_S = 3.0

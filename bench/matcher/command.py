@@ -27,7 +27,9 @@ PARTS = ("calibration", "useful", "speed", "live")
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of `python -m bench matcher`."""
-    parser.add_argument("--traces", type=Path, help="folder with index.json and NAME.csv.gz (see docs/benchmarks.md)")
+    parser.add_argument(
+        "--traces", type=Path, help="folder with index.json and NAME.csv.gz (see docs/develop/benchmarks.md)"
+    )
     parser.add_argument("--quick", action="store_true", help="one trace of each family, no fleet of thousands")
     parser.add_argument("--only", choices=PARTS, help="this part alone")
     parser.add_argument(

@@ -34,7 +34,7 @@ _UNITS_S = {"s": 1.0, "m": 60.0, "h": 3600.0, "d": 86_400.0}
 _EPILOG = """\
 shows: who connected, lost its stream, was refused, and who is gone and why (lease_expired, certificate_expired,
 revoked, drained, left, policy); refusals of what was sent; the control plane's own starts and stops. Times are UTC.
-With --json each event is a line of its own. What each kind means: docs/events.md.
+With --json each event is a line of its own. What each kind means: docs/operate/events.md.
 
 examples:
   plr events --tls-dir ~/.plr/alice --address control.example.org:50051

@@ -55,7 +55,7 @@ def least_set(prospects: Sequence[Prospect], target: float) -> Prospect | None:
 def paths_needed(epsilon: float, target: float) -> int | None:
     """How many paths that miss with `epsilon` each, independently, all miss with at most `target`; None: no number.
 
-    k >= log(target) / log(epsilon), for 0 < target < 1 (docs/theory.md).
+    k >= log(target) / log(epsilon), for 0 < target < 1 (docs/develop/theory.md).
     """
     if epsilon >= 1.0:
         return None

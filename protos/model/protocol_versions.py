@@ -1,7 +1,7 @@
 """Which versions of the protocol a program speaks, and which of them two programs use with each other.
 
 Each program speaks the newest that it knows, N, and N-1 beside it, so that a fleet is upgraded in any order. What may
-be added without a new version, since who does not know it leaves it out: docs/protocol.md.
+be added without a new version, since who does not know it leaves it out: docs/develop/protocol.md.
 """
 
 from __future__ import annotations

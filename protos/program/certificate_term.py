@@ -52,4 +52,4 @@ def with_remedy(refusal: CertificateError, name: str) -> str:
 
 def remedy(refusal: CertificateError, name: str) -> str:
     """Return what to do about it."""
-    return _REMEDIES.get(refusal.reason, "see docs/certificates.md").format(name=name)
+    return _REMEDIES.get(refusal.reason, "see docs/start/certificates.md").format(name=name)

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 SECONDS_PER_DAY = 86_400.0
 STRICT = 1
-SEE_ROUTES = "see docs/install.md, More than one interface"
+SEE_ROUTES = "see docs/start/install.md, More than one interface"
 
 
 def certificate(files: TlsFiles, now_wall: float) -> Iterator[Finding]:
@@ -28,7 +28,7 @@ def certificate(files: TlsFiles, now_wall: float) -> Iterator[Finding]:
     problem = term_problem(files, now_wall)
     if problem is not None:
         text, _, remedy = problem.text.partition("; ")
-        yield (warn if problem.in_force else fail)("certificate", text, remedy or "see docs/certificates.md")
+        yield (warn if problem.in_force else fail)("certificate", text, remedy or "see docs/start/certificates.md")
     else:
         lists = [one for one in files.trust.lists().values() if one is not None]
         held = ", ".join(f"number {one.number}, signed {duration(now_wall - one.signed_at)} ago" for one in lists)
@@ -70,7 +70,9 @@ def certificate_in_use(used: Mapping[str, Any], now_wall: float) -> Iterator[Fin
     problem = used.get("problem")
     if problem:
         text, _, remedy = str(problem.get("text")).partition("; ")
-        yield (warn if problem.get("in_force") else fail)("certificate", text, remedy or "see docs/certificates.md")
+        yield (warn if problem.get("in_force") else fail)(
+            "certificate", text, remedy or "see docs/start/certificates.md"
+        )
         return
     lists = used.get("revocation_lists") or ()
     held = ", ".join(f"number {one['number']}, signed {duration(now_wall - one['signed_at'])} ago" for one in lists)
@@ -109,7 +111,7 @@ def ros(environment: Mapping[str, str], shell: Mapping[str, str], problem: str |
     """Judge ROS by the sidecar's `environment`; `problem` is what `sidecar.ros.environment` found."""
     if problem is not None:
         remedy = (
-            "mend the environment of the unit (/etc/plr/sidecar.env) or of this shell: docs/install.md, ROS on the host"
+            "mend the environment of the unit (/etc/plr/sidecar.env) or here: docs/start/install.md, ROS on the host"
         )
         yield fail("ros", problem, remedy)
     else:
@@ -167,7 +169,7 @@ def interfaces(choice: InterfaceChoice) -> Iterator[Finding]:
     }
     for skipped in choice.skipped:
         if skipped.wanted:
-            cure = cures.get(skipped.reason, "see docs/troubleshooting.md").replace("{}", skipped.name)
+            cure = cures.get(skipped.reason, "see docs/operate/troubleshooting.md").replace("{}", skipped.name)
             yield warn("interface", f"{skipped.name}: {skipped.reason}; it carries nothing now", cure)
     for name in choice.missing:
         yield warn("interface", f"{name}: configured, and not there", "plug it in, or correct `interfaces`: ip link")

@@ -77,7 +77,7 @@ def node(state: State, expected: str | None) -> Iterator[Finding]:
     if told.get("insecure"):
         yield warn("sidecar", "insecure: true: everybody is believed to be who they say", "use tls_dir: plr ca issue")
     for refused in state.get("refused_peers") or ():
-        yield warn("peer", f"{refused['name']} is not talked to: {refused['why']}", "see docs/certificates.md")
+        yield warn("peer", f"{refused['name']} is not talked to: {refused['why']}", "see docs/start/certificates.md")
 
 
 def stun(state: State) -> Iterator[Finding]:
@@ -102,7 +102,7 @@ def stun(state: State) -> Iterator[Finding]:
                 yield ok("stun", f"{what} ({why}): harmless, as the other family is answered")
             else:
                 remedy = "3478/udp of the control plane, a route over this interface, rp_filter"
-                yield warn("stun", f"{what}: {why}", f"look at {remedy}: docs/troubleshooting.md, STUN fails")
+                yield warn("stun", f"{what}: {why}", f"look at {remedy}: docs/operate/troubleshooting.md, STUN fails")
         if interface["stun"]:
             continue
         if families := interface.get("stun_families"):
@@ -148,7 +148,7 @@ def devices(state: State) -> Iterator[Finding]:
             yield warn(
                 "interface",
                 f"{interface['name']}: its socket is bound to an address, not to the device",
-                "let the unit have CAP_NET_RAW: docs/install.md, More than one interface",
+                "let the unit have CAP_NET_RAW: docs/start/install.md, More than one interface",
             )
         if interface.get("hangs"):
             times = interface["hangs"]
@@ -203,14 +203,14 @@ def paths(state: State, pings: Mapping[PathKey, Pinged]) -> Iterator[Finding]:
         yield fail(
             "path",
             f"nothing is reached over {', '.join(sorted(by_interface))}: {_why(state['paths'])}",
-            "look at the interfaces above, then at the peers' UDP port: docs/troubleshooting.md, A path is down",
+            "look at the interfaces above, then the peers' UDP port: docs/operate/troubleshooting.md, A path is down",
         )
     else:
         for name in sorted(dark_interfaces):
             yield warn(
                 "path",
                 f"{name}: no peer is reached over it, while others are elsewhere: {_why(by_interface[name])}",
-                f"the carrier or a firewall on it: ping -I {name} CLOUD; docs/troubleshooting.md, A path is down",
+                f"carrier or firewall: ping -I {name} CLOUD; docs/operate/troubleshooting.md, A path is down",
             )
         for name in sorted(dark_peers):
             ones = [one for one in by_peer[name] if one["interface"] not in dark_interfaces]
@@ -256,7 +256,7 @@ def _path(path: Mapping[str, Any], pinged: Pinged | None) -> Finding:
     if _is_down(path):
         why = f", {path['reason']}" if path["reason"] else ""
         remedy = f"ping -I {path['interface']} {path['address'][0] if path['address'] else path['peer']}"
-        return warn("path", f"{name}: down{since}{why}", f"{remedy}; docs/troubleshooting.md, A path is down")
+        return warn("path", f"{name}: down{since}{why}", f"{remedy}; docs/operate/troubleshooting.md, A path is down")
     lost = path["lost"] / path["sent"] if path["sent"] else 0.0
     measured = f"round trip {milliseconds(path['rtt_s'])}" if path["rtt_s"] else "round trip unknown"
     text = f"{name}: {path['state']}{since}, {measured}, {share(lost)} lost"
@@ -332,7 +332,9 @@ def services(state: State) -> Iterator[Finding]:
     if carried:
         yield ok("service", f"offered {'here' if robot else 'to robots'}: {', '.join(sorted(carried))}")
     else:
-        yield warn("service", "none is offered", "docs/troubleshooting.md, The service does not appear on the robot")
+        yield warn(
+            "service", "none is offered", "docs/operate/troubleshooting.md, The service does not appear on the robot"
+        )
 
 
 def _domain(node: Mapping[str, Any]) -> tuple[str, str]:
@@ -398,5 +400,5 @@ def control(state: State) -> Iterator[Finding]:
     yield warn(
         "control",
         f"{names} not reached for {since}: {why}; requests go on by the last mapping",
-        "docs/troubleshooting.md, The control plane is out of reach",
+        "docs/operate/troubleshooting.md, The control plane is out of reach",
     )

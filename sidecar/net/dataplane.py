@@ -1,6 +1,6 @@
 """The data plane as the rest of the sidecar sees it: the engine behind one lock, a thread for each interface.
 
-Who waits for whom (docs/adr/0004-threads-and-one-lock.md): an interface's thread builds, parses and sends its
+Who waits for whom (docs/develop/adr/0004-threads-and-one-lock.md): an interface's thread builds, parses and sends its
 datagrams without any lock; the engine's lock is held only while tables are read and written. There is no coordinator
 thread: whoever has news for the engine (a link's thread, a ROS thread) takes the lock, tells it, and queues what
 comes out.

@@ -1,6 +1,6 @@
 """A timer of the kernel as a file descriptor: Python 3.11 has none, and epoll's own timeout counts whole milliseconds.
 
-timerfd_create(2). What it gains over epoll's timeout: docs/adr/0004-threads-and-one-lock.md.
+timerfd_create(2). What it gains over epoll's timeout: docs/develop/adr/0004-threads-and-one-lock.md.
 """
 
 from __future__ import annotations

@@ -54,7 +54,7 @@ def problem(environment: Mapping[str, str] = os.environ, *, thorough: bool = Fal
         return (
             f"ROS 2's rclpy in {' '.join(folders)} was not built for {sys.executable}, which is Python "
             f"{sys.version_info.major}.{sys.version_info.minor}: make the environment with ROS's own Python; for ROS "
-            "from apt: /usr/bin/python3 -m venv --system-site-packages (docs/install.md, ROS from apt)"
+            "from apt: /usr/bin/python3 -m venv --system-site-packages (docs/start/install.md, ROS from apt)"
         )
     rmw = environment.get("RMW_IMPLEMENTATION", "")
     if not thorough and rmw in ("", DEFAULT_RMW):
@@ -79,7 +79,7 @@ def _without_apt(machine: str) -> str:
     """Return what to do on a `machine`, as uname names it, that has no ROS from apt yet."""
     if machine == "x86_64":
         return "in the checkout: pip install '.[ros]'"
-    return f"install it: no wheel of it is for {machine} (docs/install.md, ROS from apt)"
+    return f"install it: no wheel of it is for {machine} (docs/start/install.md, ROS from apt)"
 
 
 def _try(environment: Mapping[str, str]) -> str | None:

@@ -1,7 +1,7 @@
 """The sidecar's ROS node and a small loop that waits on its entities: one thread owns everything of ROS.
 
 rclpy's own executors are not used: the standard ones build their lists anew in Python for each event, and the
-experimental EventsExecutor starves the other threads of the process (docs/adr/0007-one-thread-owns-ros.md).
+experimental EventsExecutor starves the other threads of the process (docs/develop/adr/0007-one-thread-owns-ros.md).
 """
 
 from __future__ import annotations

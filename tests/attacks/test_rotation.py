@@ -54,7 +54,7 @@ def test_everything_is_rotated(rotating: World, rotation_seconds: float) -> None
     old, new = world.system.authority, Authority.create("next")
     roles = {name: old.latest(name).role for name in NODES}
     both, lists = old.ca_pem + new.ca_pem, old.crl_pem() + new.crl_pem()
-    # As in docs/certificates.md: everybody believes both CAs, then everybody gets a certificate of the new one, then
+    # As in docs/start/certificates.md: all believe both CAs, then all get a certificate of the new one, then
     # nobody believes the old one.
     for name in NODES:
         install(world, name, old.renew(name, days=100), both, lists)

@@ -41,7 +41,7 @@ DASHBOARDS = sorted((DEPLOY / "grafana").glob("*.json"))
 PROMETHEUS = DEPLOY / "prometheus"
 RULES = PROMETHEUS / "plr-rules.yml"
 RULE_TESTS = sorted((PROMETHEUS / "tests").glob("*.yml"))
-RUNBOOK = DEPLOY.parent / "docs" / "runbook.md"
+RUNBOOK = DEPLOY.parent / "docs" / "operate" / "runbook.md"
 RECORDED = r"\w+:\w+:\w+"
 """Names of what is recorded: level, metric, what was done to it."""
 

@@ -27,7 +27,7 @@ from sidecar.ros.errors import RosBridgeError
 from sidecar.ros.rcl import MessageType
 
 HUGE_BYTES = 16 << 20
-"""The longest request (docs/limits.md)."""
+"""The longest request (docs/operate/limits.md)."""
 MORE_ADDRESS_SPACE_BYTES = 8 * HUGE_BYTES
 """Beyond what rclpy's libraries take: two copies of the bytes, three times them as a message, the allocator's rest."""
 INTERESTING = (b"\xff\xff\xff\xff", b"\xff\xff\xff\x7f", b"\x00\x00\x00\x80", b"\x00\x00\x00\x10", b"\x00\x00\x10\x00")

@@ -58,7 +58,7 @@ def test_without_rclpy_it_says_where_to_get_it(monkeypatch: pytest.MonkeyPatch) 
     ("machine", "told"),
     [
         ("x86_64", "without, in the checkout: pip install '.[ros]'"),
-        ("aarch64", "without, install it: no wheel of it is for aarch64 (docs/install.md, ROS from apt)"),
+        ("aarch64", "without, install it: no wheel of it is for aarch64 (docs/start/install.md, ROS from apt)"),
     ],
 )
 def test_wheels_of_ros_are_offered_only_where_there_are_some(

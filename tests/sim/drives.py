@@ -1,7 +1,7 @@
 """Requests over two paths whose rates change as a scenario's trace says, in simulated time, with the real cores.
 
 `python -m tests.sim.drives --traces FOLDER` prints what each redundancy mode misses and costs on recorded drives
-(docs/redundancy.md). Links are first in, first out, as those of `bench.evaluation.ideal`; nothing but the rates, delays
+(docs/use/redundancy.md). Links are first in, first out, as those of `bench.evaluation.ideal`; nothing but the rates, delays
 and losses of the trace disturbs anybody.
 """
 

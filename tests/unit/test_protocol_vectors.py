@@ -1,4 +1,4 @@
-"""The values of docs/protocol-vectors.json, computed with our code and with one written from docs/protocol.md alone.
+"""The values of docs/develop/protocol-vectors.json, with our code and with one written from protocol.md alone.
 
 What is called `independent` here uses nothing of ours: X25519, ECDSA and the two AEADs of `cryptography`, HMAC and
 SHA-256 of the standard library. Where the page is wrong or silent, it can not be right.
@@ -51,7 +51,7 @@ if TYPE_CHECKING:
 
     from sidecar.core.crypto.key_schedule import PairKeys
 
-DOCS = Path(__file__).parents[2] / "docs"
+DOCS = Path(__file__).parents[2] / "docs" / "develop"
 PAGE = (DOCS / "protocol.md").read_text(encoding="utf-8")
 VECTORS: dict[str, Any] = json.loads((DOCS / "protocol-vectors.json").read_text(encoding="utf-8"))
 GIVEN: dict[str, Any] = VECTORS["given"]
@@ -467,7 +467,7 @@ def test_the_numbers_on_the_page_are_those_of_the_code() -> None:
 
 
 def test_the_counters_on_the_page_are_those_of_the_metrics() -> None:
-    metrics = (DOCS / "metrics.md").read_text(encoding="utf-8")
+    metrics = (DOCS.parent / "operate" / "metrics.md").read_text(encoding="utf-8")
     named = [name for row in table("## What is dropped, and its counter") for name in re.findall(r"`(\w+)`", row[1])]
     assert len(named) > 20
     assert [name for name in named if f"`{name}`" not in metrics] == []
@@ -476,4 +476,4 @@ def test_the_counters_on_the_page_are_those_of_the_metrics() -> None:
 def test_the_tests_that_the_page_names_exist() -> None:
     named = set(re.findall(r"`(tests/[a-z_/]+\.py)`", PAGE))
     assert len(named) > 10
-    assert [name for name in sorted(named) if not (DOCS.parent / name).exists()] == []
+    assert [name for name in sorted(named) if not (DOCS.parents[1] / name).exists()] == []

@@ -3,7 +3,7 @@ often than by chance two of a robot's paths miss together.
 
 Requests of the service that really ran are the best witness. For pairs that carried few or none, what the network
 takes (`network`) and what the server needs (`processing`) are put together.
-What is computed, and why: docs/theory.md.
+What is computed, and why: docs/develop/theory.md.
 """
 
 from __future__ import annotations

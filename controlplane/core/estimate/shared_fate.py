@@ -2,7 +2,7 @@
 
 What is asked here is what two interfaces have in common, such as a carrier, not what a path does this minute: so this
 remembers for long, whichever servers a mapping names meanwhile, and what chance would bring comes from the same
-requests. Why so: docs/theory.md, "Interfaces that fail together".
+requests. Why so: docs/develop/theory.md, "Interfaces that fail together".
 """
 
 from __future__ import annotations

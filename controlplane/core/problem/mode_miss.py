@@ -1,4 +1,4 @@
-"""How likely a request misses its deadline in the way its service sends copies (docs/redundancy.md, docs/theory.md).
+"""How likely a request misses its deadline in the way its service sends copies (docs/use/redundancy.md).
 
 The mapping is chosen as if every pair in it carried a copy at once. That is what `replicate` does; with the other modes
 more is missed, and this says how much, for what the operator is told. With first pair f and second pair s:

@@ -72,7 +72,7 @@ class _RedundancyModeEnumTypeWrapper(_enum_type_wrapper._EnumTypeWrapper[_Redund
     REDUNDANCY_MODE_ADAPTIVE: _RedundancyMode.ValueType  # 4
 
 class RedundancyMode(_RedundancyMode, metaclass=_RedundancyModeEnumTypeWrapper):
-    """Which of the mapped pairs carry a copy of a request, and when (docs/redundancy.md)."""
+    """Which of the mapped pairs carry a copy of a request, and when (docs/use/redundancy.md)."""
 
 REDUNDANCY_MODE_REPLICATE: RedundancyMode.ValueType  # 0
 """All at once; also what a sidecar does that tells none."""

@@ -6,7 +6,7 @@ copy that failed, and its server is out of favour for a while. When the first go
 called off: what is unsent of them stays here, and their servers are told. What a called-off copy would have taken,
 nobody knows, and to measure only those that were not called off would flatter every path. So one request in
 `OBSERVED_ONE_IN` is a full race whose copies are all measured, and the others are not measured at all
-(docs/architecture.md, "What is measured").
+(docs/develop/architecture.md, "What is measured").
 In a race, once the deadline is over and another copy has won, a copy that has not arrived is called off: its time in
 the network is known to be longer than that, and is reported so.
 """

@@ -2,7 +2,7 @@
 
 A ROS client made with the default profile keeps the last 10 answers it has not looked at yet; the 11th pushes the
 first one out, and that call never returns. A network that was dark hands over many answers at once, so each client
-gets a few at once and the rest spaced (docs/adr/0008-pacing-for-shallow-queues.md). A client that asks one thing at a
+gets a few at once and the rest spaced (docs/develop/adr/0008). A client that asks one thing at a
 time is never held back: each of its requests earns an answer.
 
 Of those held back, answers in time go before late ones: what was asked before an outage does not delay the answer to

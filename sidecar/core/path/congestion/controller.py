@@ -2,7 +2,7 @@
 
 A model of the path, after BBR (draft-ietf-ccwg-bbr): the rate at which it delivers and the round trip of its empty
 queue say how fast to send and how much to have in flight. Losses that mean congestion put a ceiling on that. Why so:
-docs/adr/0010-congestion-by-model-and-ceiling.md.
+docs/develop/adr/0010-congestion-by-model-and-ceiling.md.
 """
 
 from __future__ import annotations

@@ -49,7 +49,7 @@ def content(*outcomes: Outcome, again: list[Outcome] | None = None) -> Mapping[s
 
 def checkout(folder: Path, page: str | None = None) -> Path:
     """A checkout whose pages have a place for every block, or one page alone."""
-    (folder / "docs").mkdir()
+    (folder / "docs" / "develop").mkdir(parents=True)
     blocks = "".join(f"<!-- evaluation: {name} -->\nold\n<!-- end -->\n" for name in all_blocks({}))
     (folder / "README.md").write_text(blocks if page is None else page)
     return folder
@@ -68,12 +68,12 @@ def test_published_files_are_as_they_were_written() -> None:
 
 def test_the_pages_have_a_place_for_every_figure(tmp_path: Path) -> None:
     for file, text in publish.pages(ROOT).items():
-        (tmp_path / file.relative_to(ROOT)).parent.mkdir(exist_ok=True)
+        (tmp_path / file.relative_to(ROOT)).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / file.relative_to(ROOT)).write_text(text)
     written = publish.publish(tmp_path, content(*evaluation()), "summary", SVG, RECORDS)
     about = {one.file.relative_to(tmp_path).as_posix(): one.about for one in written}
     assert about["README.md"].endswith("figures in drives")
-    assert about["docs/results/evaluation.md"] == "1 charts beside it, 0 kB"
+    assert about["docs/develop/results/evaluation.md"] == "1 charts beside it, 0 kB"
     assert publish.publish(tmp_path, content(*evaluation()), "summary", SVG, RECORDS) == written
 
 

@@ -85,7 +85,7 @@ def test_an_evaluation_is_compared_with_published_figures_as_with_its_records(tm
 def test_what_is_no_published_evaluation_is_refused(tmp_path: Path, text: str) -> None:
     file = tmp_path / "evaluation.json"
     file.write_text(text)
-    with pytest.raises(ValueError, match=r"expected the data of a report, as docs/results/evaluation\.json"):
+    with pytest.raises(ValueError, match=r"expected the data of a report, as docs/develop/results/evaluation\.json"):
         Measured.published(file)
 
 

@@ -160,7 +160,7 @@ def test_every_command_has_help(command: str, capsys: pytest.CaptureFixture[str]
 def test_the_commands_of_the_page_work_in_their_order(
     shell: Shell, monkeypatch: pytest.MonkeyPatch, cheap_guesses: None
 ) -> None:
-    page = Path(__file__).parents[4] / "docs" / "certificates.md"
+    page = Path(__file__).parents[4] / "docs" / "start" / "certificates.md"
     commands = [
         command.split() for command in re.findall(r"^ *plr (.*)$", page.read_text(encoding="utf-8"), re.MULTILINE)
     ]
