@@ -1,8 +1,8 @@
 """Requests over two paths whose rates change as a scenario's trace says, in simulated time, with the real cores.
 
 `python -m tests.sim.drives --traces FOLDER` prints what each redundancy mode misses and costs on recorded drives
-(docs/use/redundancy.md). Links are first in, first out, as those of `bench.evaluation.ideal`; nothing but the rates, delays
-and losses of the trace disturbs anybody.
+(docs/use/redundancy.md). Links are first in, first out, as those of `bench.evaluation.ideal`. Only the rates, delays
+and losses of the trace disturb anybody.
 """
 
 from __future__ import annotations
