@@ -22,8 +22,8 @@ from protos.trust.clock_floor import ClockFloor
 from protos.trust.pair_token import pair_token
 from sidecar.core.base.values import RequestId
 from sidecar.core.engine.engine import Engine, EngineConfig
-from sidecar.core.link.datagrams import LinkIdentity
 from sidecar.core.link.link import Link
+from sidecar.core.link.sender import LinkIdentity
 from sidecar.core.rules.service_rule import ServiceRule
 from sidecar.core.seam.application import ExecuteRequest, RequestFailed, ResponseArrived
 from sidecar.core.seam.links import SetReady
@@ -33,7 +33,7 @@ from sidecar.state.start_session import start_session
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from sidecar.core.link.datagrams import Batch
+    from sidecar.core.link.sender import Batch
 
 SERVICE = ServiceName("/bench")
 TYPE = "bench/srv/Bytes"

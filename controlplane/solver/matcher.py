@@ -15,8 +15,7 @@ from typing import TYPE_CHECKING
 from controlplane.core.problem.plan import Plan, make_plan
 from controlplane.core.problem.problem import FleetKey, reachable
 from controlplane.core.solve.decomposition import Decomposition
-from controlplane.core.solve.grouping import independent_groups
-from controlplane.core.solve.limits import Limits
+from controlplane.core.solve.limits import Limits, independent_groups
 from controlplane.solver.group import SMALL_BLOCKS, solve_group
 
 if TYPE_CHECKING:

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
     from protos.trust.credential import SessionCredential
     from sidecar.core.crypto.key_schedule import PairKeys
-    from sidecar.core.link.datagrams import LinkIdentity
+    from sidecar.core.link.sender import LinkIdentity
     from sidecar.core.path.keys import SealingKeys
     from sidecar.core.path.path import Path
     from sidecar.core.seam.links import LinkPeer

@@ -17,8 +17,8 @@ from protos.model.ids import Role, ServiceName
 from sidecar.core.base.values import PathState, Priority, RejectReason, RequestId
 from sidecar.core.crypto.key_schedule import proof_of_offer
 from sidecar.core.crypto.session import public_key
-from sidecar.core.link.datagrams import Batch
 from sidecar.core.link.link import Link
+from sidecar.core.link.sender import Batch
 from sidecar.core.wire import frame
 from sidecar.core.wire.messages import (
     CancelMessage,

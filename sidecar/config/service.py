@@ -26,8 +26,7 @@ from sidecar.config.fields import (
 from sidecar.core.base.values import Priority
 from sidecar.core.robot.fallback.queue import SPARE
 from sidecar.core.rules.budget import Budget
-from sidecar.core.rules.fallback_rule import FallbackRule
-from sidecar.core.rules.service_rule import MAX_LIFETIME_S, ServiceRule
+from sidecar.core.rules.service_rule import MAX_LIFETIME_S, FallbackRule, ServiceRule
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

@@ -13,7 +13,7 @@ import struct
 import sys
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from sidecar.core.link.datagrams import Batch
+from sidecar.core.link.sender import Batch
 from sidecar.net.sockets import normalise, to_sockaddr
 
 if TYPE_CHECKING:

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 from protos.model.ids import InterfaceId, InterfaceName
 from sidecar.core.interfaces.readiness import Readiness
 from sidecar.core.interfaces.scan_schedule import WITHOUT_NEWS_S, ScanSchedule
-from sidecar.core.link.datagrams import LinkIdentity
+from sidecar.core.link.sender import LinkIdentity
 from sidecar.core.path.key_exchange import KeyLimits
 from sidecar.core.stun.events import Failed, Mapped, MappingChanged
 from sidecar.net.host_names import HostNames

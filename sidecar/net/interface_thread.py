@@ -12,7 +12,7 @@ from collections import deque
 from typing import TYPE_CHECKING, Protocol
 
 from sidecar.core.base.values import PathState
-from sidecar.core.link.datagrams import Batch
+from sidecar.core.link.sender import Batch
 from sidecar.core.path.history import PathHistory
 from sidecar.core.seam.links import PathChanged, Rebind
 from sidecar.core.wire.frame import FIRST_BYTE, MAX_DATAGRAM_BYTES

@@ -24,8 +24,8 @@ if TYPE_CHECKING:
     from collections.abc import Iterable
 
     from protos.model.ids import Address, InterfaceName
-    from sidecar.core.link.datagrams import LinkIdentity
     from sidecar.core.link.memory import LinkMemory
+    from sidecar.core.link.sender import LinkIdentity
     from sidecar.core.path.key_exchange import KeyLimits
     from sidecar.core.seam.links import Rebind
     from sidecar.net.interface_thread import LinkOwner

@@ -24,8 +24,8 @@ from protos.model.mapping import Assignment, MappingSet, ServiceMapping
 from protos.model.members import Candidate, CandidateKind, PeerSet, ServiceOffer
 from sidecar.core.base.values import RequestId
 from sidecar.core.engine.engine import EngineConfig
-from sidecar.core.link.datagrams import LinkIdentity
 from sidecar.core.link.link import Link
+from sidecar.core.link.sender import LinkIdentity
 from sidecar.core.rules.service_rule import ServiceRule
 from sidecar.core.seam.application import ApplicationEvent, OfferService, RequestFailed, ResponseArrived
 from sidecar.core.seam.links import SetReady

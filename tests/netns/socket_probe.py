@@ -25,7 +25,7 @@ import time
 from typing import TYPE_CHECKING, Any
 
 from protos.model.ids import InterfaceName
-from sidecar.core.link.datagrams import Batch
+from sidecar.core.link.sender import Batch
 from sidecar.core.seam.stats import LinkStats
 from sidecar.net.batch_socket import BatchSocket
 from sidecar.net.interfaces import Interface, choose, list_interfaces

@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from protos.model.ids import ServiceName
-from sidecar.core.rules.fallback_rule import FallbackRule
-from sidecar.core.rules.service_rule import ServiceRule
+from sidecar.core.rules.service_rule import FallbackRule, ServiceRule
 from tests.ros.mesh import wait_until
 
 if TYPE_CHECKING:

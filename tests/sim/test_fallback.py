@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from protos.model.ids import Role, ServiceName
 from sidecar.core.robot.fallback.fallbacks import Fallbacks
-from sidecar.core.rules.fallback_rule import FallbackRule
+from sidecar.core.rules.service_rule import FallbackRule
 from sidecar.core.seam.application import DeadlineMissed, RequestFailed, ResponseArrived, Unreachable
 from tests.support.mesh import SERVICE, Mesh, rule
 

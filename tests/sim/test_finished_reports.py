@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from sidecar.core.link import datagrams
+from sidecar.core.link import sender
 from sidecar.core.seam.links import LinkCommand, SendFinished
 from tests.support.mesh import Mesh, rule
 
@@ -56,7 +56,7 @@ def test_a_report_that_nobody_sends_again_is_asked_for(monkeypatch: pytest.Monke
 
 
 def test_reports_that_nobody_watches_are_asked_for(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(datagrams, "MAX_RUNS_IN_FLIGHT", 0)
+    monkeypatch.setattr(sender, "MAX_RUNS_IN_FLIGHT", 0)
     mesh = Mesh(1)
     robot = mesh.robot("wlan0", rules=(rule(deadline_s=1.0, lifetime_s=200.0),))
     cloud = mesh.cloud("cloud-a")

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from sidecar.core.link import datagrams
+from sidecar.core.link import sender
 from sidecar.core.message import reassembly
 from sidecar.core.wire import frame
 from sidecar.core.wire.frame import BASE_SYMBOL_BYTES, MAX_MESSAGE_BYTES, MIN_SYMBOL_BYTES
@@ -106,7 +106,7 @@ def measured() -> int:
 
 @pytest.mark.parametrize("kind", FLOODS)
 def test_a_flood_costs_bounded_memory_and_harms_nobody(kind: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(datagrams, "MAX_RUNS_IN_FLIGHT", CAP // frame.MAX_FRAMES)
+    monkeypatch.setattr(sender, "MAX_RUNS_IN_FLIGHT", CAP // frame.MAX_FRAMES)
     for name in ("MAX_PEER_MESSAGES", "OVER_REMEMBERED"):
         monkeypatch.setattr(reassembly, name, CAP)
     mesh, honest, node, cloud = arena(1)

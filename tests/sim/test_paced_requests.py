@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import pytest
 
-from sidecar.core.path.turn import Turn
+from sidecar.core.path.send_queue import Turn
 from tests.support.mesh import Mesh, Node, Wire, rule
 
 if TYPE_CHECKING:

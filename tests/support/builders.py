@@ -11,9 +11,9 @@ from protos.model.members import ALL_CALLS, Candidate, CandidateKind, Peer, Serv
 from protos.trust.pair_token import pair_token
 from sidecar.core.base.values import PathId, Priority, RequestId
 from sidecar.core.crypto.aead import TAG_BYTES
-from sidecar.core.link.datagrams import LinkIdentity
 from sidecar.core.link.link import Link
 from sidecar.core.link.memory import LinkMemory
+from sidecar.core.link.sender import LinkIdentity
 from sidecar.core.message.outbound import OutboundMessage
 from sidecar.core.path.key_exchange import DEFAULT_LIMITS
 from sidecar.core.path.keys import PathKeys, make_path_keys

@@ -16,8 +16,8 @@ from sidecar.control.announcement import Announcer
 from sidecar.core.base.request_id import make_request_id
 from sidecar.core.base.values import RequestId
 from sidecar.core.engine.engine import Engine, EngineConfig
-from sidecar.core.link.datagrams import LinkIdentity
 from sidecar.core.link.link import Link
+from sidecar.core.link.sender import LinkIdentity
 from sidecar.core.path.key_exchange import DEFAULT_LIMITS
 from sidecar.core.path.pmtu import HEADERS_V4
 from sidecar.core.rules.service_rule import ServiceRule

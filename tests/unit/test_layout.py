@@ -89,7 +89,6 @@ controlplane/core/explain/explanation.py
 controlplane/core/explain/fleet_view.py
 controlplane/core/explain/returning.py
 controlplane/core/explain/status.py
-controlplane/core/formulation/block_rules.py
 controlplane/core/formulation/surplus.py
 controlplane/core/overload/postponed.py
 controlplane/core/policy/cut_off.py
@@ -106,7 +105,6 @@ controlplane/core/solve/batch.py
 controlplane/core/solve/batch_costs.py
 controlplane/core/solve/enumeration.py
 controlplane/core/solve/incumbent.py
-controlplane/core/solve/limits.py
 controlplane/core/solve/path_bound.py
 controlplane/core/solve/server_groups.py
 sidecar/core/base/report_scope.py
@@ -115,11 +113,10 @@ sidecar/core/cloud/answer_cache.py
 sidecar/core/cloud/serving.py
 sidecar/core/engine/attention.py
 sidecar/core/engine/revocation_exchange.py
-sidecar/core/link/datagrams.py
 sidecar/core/link/liveness.py
-sidecar/core/link/opener.py
 sidecar/core/link/path_table.py
-sidecar/core/link/reader.py
+sidecar/core/link/receiver.py
+sidecar/core/link/sender.py
 sidecar/core/message/partial.py
 sidecar/core/path/address.py
 sidecar/core/path/congestion/bandwidth_search.py
@@ -128,13 +125,10 @@ sidecar/core/path/in_flight.py
 sidecar/core/path/key_exchange.py
 sidecar/core/path/view.py
 sidecar/core/robot/dispatch/context.py
-sidecar/core/robot/dispatch/path_records.py
 sidecar/core/robot/fallback/queue.py
-sidecar/core/robot/fallback/times.py
 sidecar/core/robot/request/index.py
 sidecar/core/robot/request/request.py
 sidecar/core/rules/budget.py
-sidecar/core/rules/fallback_rule.py
 sidecar/core/seam/application.py
 sidecar/core/seam/links.py
 sidecar/core/seam/stats.py

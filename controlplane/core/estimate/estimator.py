@@ -13,8 +13,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, TypeVar
 
 from controlplane.core.estimate.composed import Asked, from_parts, parts_of, slower_than
-from controlplane.core.estimate.fading import FadedCount, FadedShares
-from controlplane.core.estimate.forgetting import forget_after_s, forget_before
+from controlplane.core.estimate.fading import FadedCount, FadedShares, forget_after_s, forget_before
 from controlplane.core.estimate.interface_trouble import InterfaceTrouble
 from controlplane.core.estimate.late_fate import LateFate
 from controlplane.core.estimate.network import PathView, RobotNetwork

@@ -1,4 +1,7 @@
-"""Histograms and counts that forget: every sample's weight halves with each half-life that passes."""
+"""Keeps histograms and counts that forget: every sample's weight halves with each half-life.
+
+Tables of them forget as well: names of robots and servers come and go without end, and must not all be kept.
+"""
 
 from __future__ import annotations
 
@@ -6,7 +9,7 @@ import math
 from array import array
 from bisect import bisect_left
 from itertools import accumulate
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 
@@ -16,6 +19,9 @@ from protos.base.histogram import BUCKETS, MAX_COUNT, MIDS, Histogram
 from protos.base.size_class import SIZE_CLASSES
 
 if TYPE_CHECKING:
+    from collections import OrderedDict
+    from collections.abc import Callable
+
     from numpy.typing import NDArray
 
     from controlplane.core.estimate.change_detection import ChangeWatch
@@ -248,3 +254,24 @@ class FadedHistogram:
         slower = np.cumprod(1.0 - np.minimum(hazard, 1.0))
         before = np.concatenate(([1.0], slower[:-1]))
         return Distribution.of(before - slower, float(slower[-1]))
+
+
+K = TypeVar("K")
+V = TypeVar("V")
+
+FORGET_S = 3600.0
+"""At least so long is kept what is not reported any more: who is back after a break finds its past."""
+
+FORGET_HALF_LIVES = 30.0
+"""And for so many half-lives: of a billion samples one is left then."""
+
+
+def forget_after_s(half_life_s: float) -> float:
+    """How long what fades with this half-life is kept after it was added to last."""
+    return max(FORGET_S, FORGET_HALF_LIVES * half_life_s)
+
+
+def forget_before(table: OrderedDict[K, V], since: float, at: Callable[[V], float]) -> None:
+    """Take out of a table, which is in the order of `at`, what is older."""
+    while table and at(next(iter(table.values()))) < since:
+        table.popitem(last=False)

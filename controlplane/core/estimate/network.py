@@ -15,8 +15,7 @@ from itertools import islice
 from statistics import median
 from typing import TYPE_CHECKING, NamedTuple, TypeVar
 
-from controlplane.core.estimate.fading import FadedCount, FadedHistogram
-from controlplane.core.estimate.forgetting import forget_before
+from controlplane.core.estimate.fading import FadedCount, FadedHistogram, forget_before
 from controlplane.core.estimate.staleness import HeardClock
 from protos.base.histogram import Histogram
 

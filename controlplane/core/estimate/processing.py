@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 from controlplane.core.estimate.change_detection import ChangeWatch
 from controlplane.core.estimate.distribution import Distribution
-from controlplane.core.estimate.fading import FadedCount, FadedHistogram
-from controlplane.core.estimate.forgetting import forget_after_s
+from controlplane.core.estimate.fading import FadedCount, FadedHistogram, forget_after_s
 from controlplane.core.estimate.staleness import HeardClock
 from controlplane.core.estimate.witnesses import COUNTS_ANYWAY, Witnesses
 from protos.base.histogram import Histogram

@@ -9,8 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from controlplane.core.policy.pattern_index import PatternIndex
-from controlplane.core.policy.patterns import matches
+from controlplane.core.policy.patterns import PatternIndex, matches
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterable, Sequence

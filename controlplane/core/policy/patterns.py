@@ -1,6 +1,10 @@
-"""Shell-style patterns for names: `*` any text ('/' included), `?` one character, `[ab]` or `[!ab]` one of or none of.
+"""Matches names with shell-style patterns, one by one or many at once.
 
-Case counts. The dialect is Python's `fnmatch.fnmatchcase`, as in the sidecars' `services[].name`.
+`*` is any text ('/' included), `?` one character, `[ab]` or `[!ab]` one of or none of. Case counts. The dialect is
+Python's `fnmatch.fnmatchcase`, as in the sidecars' `services[].name`.
+
+A pattern can only match names that begin with its text before the first special character. `PatternIndex` uses this: a
+fleet with a rule for each robot costs one look-up of each beginning of a name, not a match against each rule.
 """
 
 from __future__ import annotations
@@ -10,6 +14,11 @@ import fnmatch
 import functools
 import re
 import string
+from collections import defaultdict
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
 
 MAX_PATTERN_CHARACTERS = 255
 """No name is longer (protos/model/names.py)."""
@@ -96,3 +105,32 @@ def _units(pattern: str) -> list[str]:
         units.append(pattern[position:end])
         position = end
     return units
+
+
+_PLAIN_BEGINNING = re.compile(r"[^*?\[]*")
+
+
+class PatternIndex:
+    """Lists of patterns by number, from 0 on."""
+
+    def __init__(self, lists: Iterable[tuple[str, ...]]) -> None:
+        self._plain: defaultdict[str, set[int]] = defaultdict(set)
+        """Patterns without special characters."""
+        self._by_beginning: defaultdict[str, list[tuple[str, int]]] = defaultdict(list)
+        for number, patterns in enumerate(lists):
+            for pattern in patterns:
+                beginning = _PLAIN_BEGINNING.match(pattern)
+                assert beginning is not None
+                if beginning[0] == pattern:
+                    self._plain[pattern].add(number)
+                else:
+                    self._by_beginning[beginning[0]].append((pattern, number))
+
+    def matching(self, name: str) -> frozenset[int]:
+        """The numbers of the lists of which a pattern matches the name."""
+        found = set(self._plain.get(name, ()))
+        for length in range(len(name) + 1):
+            for pattern, number in self._by_beginning.get(name[:length], ()):
+                if number not in found and matches(name, (pattern,)):
+                    found.add(number)
+        return frozenset(found)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from controlplane.core.policy.pattern_index import PatternIndex
+from controlplane.core.policy.patterns import PatternIndex
 from controlplane.core.registry.registry import MAX_SIDECARS
 from protos.model.members import ALL_CALLS, NO_POLICY, CallPermit
 

@@ -10,12 +10,12 @@ from typing import TYPE_CHECKING
 
 from sidecar.core.base.timers import NEVER, Timers
 from sidecar.core.base.values import PathId, PathState
-from sidecar.core.link.datagrams import Batch, Burst, DatagramBuilder
 from sidecar.core.link.liveness import PathKeeper
 from sidecar.core.link.memory import LinkMemory
 from sidecar.core.link.mtu import LinkMtu
 from sidecar.core.link.path_table import PathTable
-from sidecar.core.link.reader import LinkReader
+from sidecar.core.link.receiver import LinkReader
+from sidecar.core.link.sender import Batch, Burst, DatagramBuilder
 from sidecar.core.path.key_exchange import DEFAULT_LIMITS, KeyLimits
 from sidecar.core.path.view import view_of
 from sidecar.core.seam.links import (
@@ -52,8 +52,8 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator
 
     from protos.model.ids import Address, NodeName
-    from sidecar.core.link.datagrams import LinkIdentity
     from sidecar.core.link.pinging import Pong
+    from sidecar.core.link.sender import LinkIdentity
     from sidecar.core.message.outbound import OutboundMessage
     from sidecar.core.path.path import Path
     from sidecar.core.path.view import PathView

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from protos.model.ids import Address, InterfaceId, NodeName, SessionId
-    from sidecar.core.link.datagrams import LinkIdentity
+    from sidecar.core.link.sender import LinkIdentity
     from sidecar.core.path.key_exchange import KeyLimits
     from sidecar.core.seam.links import LinkEvent, LinkPeer
 

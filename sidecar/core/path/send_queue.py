@@ -1,29 +1,123 @@
-"""Symbols that wait for one path, and which of them leave next.
+"""Decides which of the symbols that wait for one path leave next.
 
-Urgent before bulk: a message's priority comes first. Fresh before late: within a priority, those that can still make
-their deadline go first, earliest deadline first; those that can not go after them. So a backlog or an overload makes
-some messages miss, instead of each message make the next one late. Among the late, what is begun goes first and then
-the oldest that can still be of use: the newest would overtake the others again and again until these expire. What comes
-with its deadline over goes after those: after an outage the pace is low at first, and what is asked then may seem
-hopeless, but must not wait for the backlog. What can not even be answered before it expires goes last, as the pace may
-rise; when it did, what can make its deadline after all is fresh again. What another path is sending, and in time, comes
-after all that (`turn`). No priority starves: while a lower one waits, it gets one symbol in SHARE.
+Urgent before bulk: a message's priority comes first. Fresh before late: within a priority, messages that can still make
+their deadline go first, earliest deadline first, and all others after them. So a backlog makes some messages miss
+instead of making each message delay the next one. Among late messages, begun ones go first, then the oldest that can
+still be of use: newer ones would overtake them until they expire. A message that arrives with its deadline over follows
+after those: after an outage the pace is low at first, and a request made then may seem hopeless but must not wait for
+the backlog. A message that cannot even be answered before it expires goes last, as the pace may rise; when it does, the
+message may be fresh again. No priority starves: while a lower one waits, it gets one symbol in SHARE.
+
+The copies of one request on several paths are in one race (`OutboundMessage.siblings`). The path that sends a symbol
+says when it expects the answer. Until that is overdue, the other paths send other messages first, if any wait. So where
+one carrier cannot bear the load, carriers share it instead of all sending the same symbols; elsewhere all copies leave
+at once. Copies of small requests always do.
 """
 
 from __future__ import annotations
 
 import heapq
+from collections import deque
 from itertools import count
 from typing import TYPE_CHECKING, NamedTuple, TypeAlias
 
+from sidecar.core.base.timers import NEVER
 from sidecar.core.base.values import SHARE, Priority
-from sidecar.core.path.turn import Turn
 from sidecar.core.wire.frame import FRAGMENT_OVERHEAD_BYTES
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
     from sidecar.core.message.outbound import OutboundMessage
+
+HASTE = 1.25
+"""A message that has not begun to leave is late when this many times its sending time does not fit any more: what is
+begun should also be finished."""
+PATIENCE = 0.5
+"""An answer that another path expects is overdue when this part of the time from then to the deadline is over: there
+should be time left for this one."""
+
+SMALL = 0.1
+"""What takes less than this part of the time that is left is sent at once anyway: others hardly wait for it."""
+
+
+class Turn:
+    """One message on one path."""
+
+    __slots__ = ("again", "begun", "message", "next")
+
+    def __init__(self, message: OutboundMessage) -> None:
+        self.message = message
+        self.next = 0
+        self.again: deque[int] = deque()
+        """Symbols to be sent once more."""
+        self.begun = False
+        """Some of what is to be sent has left."""
+
+    def take(self, most: int) -> tuple[int, int] | None:
+        """Remove and return the next consecutive symbols as (first, count), `most` of them; None when none is left."""
+        needs = self.message.needs
+        again = self.again
+        while again:
+            first = again.popleft()
+            if needs(first):
+                end = first + 1
+                while again and again[0] == end and end - first < most and needs(end):
+                    again.popleft()
+                    end += 1
+                return first, end - first
+        last = self.message.symbols
+        first = self.next
+        while first < last and not needs(first):
+            first += 1
+        end = first
+        limit = min(last, first + most)
+        while end < limit and needs(end):
+            end += 1
+        self.next = end
+        return (first, end - first) if end > first else None
+
+    def remaining(self) -> tuple[int, ...]:
+        """The symbols that have not left and still have to."""
+        return tuple(filter(self.message.needs, (*self.again, *range(self.next, self.message.symbols))))
+
+    def can_end_by(self, end: float, now: float, pace: float, round_trip_s: float) -> bool:
+        """Whether its last symbol can be answered before `end` at this pace (bytes a second; 0: unknown)."""
+        if not pace:
+            return now < end
+        sending_s = self._sending_s(pace) * (1.0 if self.begun else HASTE)
+        return now + sending_s + round_trip_s < end
+
+    def goes_on(self, now: float, pace: float, round_trip_s: float) -> None:
+        """Some of it has been taken to be sent: tell its siblings when to expect the answer."""
+        self.begun = True
+        self.message.expected_at = now + self._sending_s(pace) + round_trip_s if pace else NEVER
+
+    def waits(self) -> None:
+        """Something else goes first: nothing is to be expected of it here."""
+        self.message.expected_at = NEVER
+
+    def covered_until(self, now: float, pace: float, round_trip_s: float) -> float | None:
+        """Until when to leave the request to another path that expects the answer in time, and sooner than this one."""
+        message = self.message
+        if len(message.siblings) < 2 or not pace:
+            return None
+        deadline = message.deadline
+        sending_s = self._sending_s(pace)
+        if sending_s < SMALL * (deadline - now):
+            return None
+        here = min(deadline, now + sending_s + round_trip_s)
+        for other in message.siblings:
+            expected_at = other.expected_at
+            if expected_at < here and other is not message:
+                overdue_at = expected_at + PATIENCE * (deadline - expected_at)
+                if now < overdue_at:
+                    return overdue_at
+        return None
+
+    def _sending_s(self, pace: float) -> float:
+        return (len(self.again) + self.message.symbols - self.next) * self.message.symbol / pace
+
 
 PURGE_AT = 64
 """Entries before the first look for messages that are over; then whenever their number has doubled."""

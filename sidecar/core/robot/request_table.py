@@ -26,7 +26,7 @@ from sidecar.core.base.values import PathId, PathState, RejectReason, RequestId
 from sidecar.core.robot.dispatch.backlog import NoRoom
 from sidecar.core.robot.dispatch.cancelling import SMALL_ANSWER_BYTES, CallingOff
 from sidecar.core.robot.dispatch.dispatcher import MAX_COPIES, Dispatching
-from sidecar.core.robot.measure.deadline_outcomes import measure_outcomes
+from sidecar.core.robot.measure.outcomes import measure_outcomes
 from sidecar.core.robot.request.request import Answer, Copy, CopyState, Request
 from sidecar.core.seam.application import DeadlineMissed, RequestFailed, ResponseArrived, Unreachable
 from sidecar.core.wire.messages import MAX_NAME_BYTES, MAX_PAYLOAD_BYTES, RejectionMessage, ResponseMessage

@@ -1,8 +1,8 @@
-"""Which services are carried, and how: the configuration's rules, matched by name.
+"""Says which services are carried, and how: the configuration's rules, matched by name.
 
-The first rule that matches wins. What is the fallback of a rule is never carried itself. Parameter and lifecycle
-services of nodes are carried only when a rule names them exactly: a glob such as /* must not open every node's
-parameters to other machines.
+The first rule that matches wins. The fallback of a rule is never carried itself. Parameter and lifecycle services of
+nodes are carried only when a rule names them exactly: a glob such as /* must not open every node's parameters to other
+machines.
 """
 
 from __future__ import annotations
@@ -21,7 +21,19 @@ if TYPE_CHECKING:
 
     from protos.model.ids import ServiceName
     from sidecar.core.message.repair import Redundancy
-    from sidecar.core.rules.fallback_rule import FallbackRule
+
+
+@dataclass(frozen=True, slots=True)
+class FallbackRule:
+    """The fallback of one service."""
+
+    service: ServiceName
+    """A service of the same type that a node on this robot serves; never carried itself."""
+    in_time: bool = True
+    """Ask it so early that it answers by the deadline; else when the network has missed."""
+    takes_s: float | None = None
+    """How long it takes, at most; None: as measured."""
+
 
 MAX_LIFETIME_S = 300.0
 """A request that may wait longer is a job, not a call; a server remembers every request for longer than this."""

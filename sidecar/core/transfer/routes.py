@@ -8,7 +8,7 @@ from operator import attrgetter
 from typing import TYPE_CHECKING
 
 from sidecar.core.base.values import PathId, PathState
-from sidecar.core.message.loss_estimate import Loss, LossEstimate
+from sidecar.core.message.repair import Loss, LossEstimate
 from sidecar.core.wire.frame import BASE_BYTES, FRAGMENT_OVERHEAD_BYTES
 
 if TYPE_CHECKING:

@@ -16,7 +16,7 @@ from sidecar.core.base.values import PathState
 
 if TYPE_CHECKING:
     from sidecar.core.base.values import PathId
-    from sidecar.core.robot.dispatch.path_pace import PathPaces
+    from sidecar.core.robot.dispatch.pair_history import PathPaces
     from sidecar.core.robot.request.request import Copy, Request
     from sidecar.core.transfer.routes import Routes
 

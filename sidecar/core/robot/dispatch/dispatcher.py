@@ -14,8 +14,7 @@ from sidecar.core.base.values import PathState
 from sidecar.core.robot.dispatch.adaptive import Adaptive
 from sidecar.core.robot.dispatch.budgets import Budgets
 from sidecar.core.robot.dispatch.exploration import Exploration
-from sidecar.core.robot.dispatch.path_pace import PathPaces
-from sidecar.core.robot.dispatch.path_records import PathRecords
+from sidecar.core.robot.dispatch.pair_history import PathPaces, PathRecords
 from sidecar.core.robot.request.request import HEDGE_AT, Copy, CopyState, Request
 from sidecar.core.wire.messages import RequestMessage, encode_message
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from dataclasses import dataclass
 from operator import itemgetter
 from typing import TYPE_CHECKING
 
@@ -12,6 +13,7 @@ from protos.model.report import (
     MAX_JOINTS,
     MAX_LATENCIES,
     MAX_PATHS,
+    InterfaceJointReport,
     JointReport,
     LatencyReport,
     OutcomeReport,
@@ -20,19 +22,70 @@ from protos.model.report import (
 )
 from sidecar.core.base.report_scope import ReportScope
 from sidecar.core.base.values import PathState
-from sidecar.core.robot.measure.interface_outcomes import JointCounts
 
 if TYPE_CHECKING:
     from protos.model.ids import InterfaceName, NodeName, ServiceName
     from protos.model.mapping import Assignment
     from sidecar.core.base.values import PathId
-    from sidecar.core.robot.measure.interface_outcomes import InterfacePair, PairOutcome
     from sidecar.core.robot.request.request import Carried
     from sidecar.core.seam.links import PathMeasured
     from sidecar.core.transfer.routes import Routes
 
 MAX_ANSWER_SIZES = 1024
 """Services whose usual size of an answer is kept: as many as a robot can carry."""
+
+
+@dataclass(frozen=True, slots=True)
+class InterfacePair:
+    """Two interfaces and, if both copies go to one server, that server."""
+
+    service: ServiceName
+    first: InterfaceName
+    second: InterfaceName
+    """After the first in the order of their names."""
+    server: NodeName | None
+
+
+@dataclass(frozen=True, slots=True)
+class PairOutcome:
+    """What became of one request."""
+
+    first_missed: bool
+    second_missed: bool
+    raced: bool
+    """It was chosen to be a full race. Else that one missed alone means nothing: the copy may have been called off."""
+
+
+class JointCounts:
+    """Of all requests over two interfaces since the last report."""
+
+    __slots__ = ("both_missed", "only_first_missed", "only_second_missed", "races", "requests")
+
+    def __init__(self) -> None:
+        self.requests = self.both_missed = self.races = self.only_first_missed = self.only_second_missed = 0
+
+    def add(self, outcome: PairOutcome) -> None:
+        """Count a request."""
+        self.requests += 1
+        self.both_missed += outcome.first_missed and outcome.second_missed
+        if outcome.raced:
+            self.races += 1
+            self.only_first_missed += outcome.first_missed and not outcome.second_missed
+            self.only_second_missed += outcome.second_missed and not outcome.first_missed
+
+    def report(self, pair: InterfacePair) -> InterfaceJointReport:
+        """What the control plane is told."""
+        return InterfaceJointReport(
+            pair.service,
+            pair.first,
+            pair.second,
+            pair.server,
+            self.requests,
+            self.both_missed,
+            self.races,
+            self.only_first_missed,
+            self.only_second_missed,
+        )
 
 
 class _Counts:

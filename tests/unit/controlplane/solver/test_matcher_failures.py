@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from controlplane.core.estimate.forgetting import FORGET_S
+from controlplane.core.estimate.fading import FORGET_S
 from controlplane.core.estimate.processing import ComputeTimes
 from controlplane.core.problem.problem import Block, BlockKey, FleetKey, Objective, Problem
 from controlplane.core.publish.snapshots import VersionSource

@@ -9,7 +9,7 @@ from protos.model.members import AT_MOST_EVERY_INTERFACE, EVERY_INTERFACE, Copie
 from protos.model.redundancy_mode import RedundancyMode
 from sidecar.core.base.values import Priority
 from sidecar.core.rules.budget import Budget
-from sidecar.core.rules.fallback_rule import FallbackRule
+from sidecar.core.rules.service_rule import FallbackRule
 from tests.unit.sidecar.configs import CLOUD, ROBOT, SAFE, parse, with_service
 
 

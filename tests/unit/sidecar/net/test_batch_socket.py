@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from protos.model.ids import InterfaceName
-from sidecar.core.link.datagrams import Batch
+from sidecar.core.link.sender import Batch
 from sidecar.core.seam.stats import LinkStats
 from sidecar.net.batch_socket import ARENA_BYTES, RECEIVE_CALLS, ROOM_BYTES, BatchSocket
 

@@ -23,8 +23,8 @@ from protos.trust.identity import NOT_YET_VALID, UNTRUSTED, CertificateError
 from protos.trust.pair_token import pair_token
 from sidecar.core.base.values import PathState, RequestId
 from sidecar.core.engine.engine import EngineConfig
-from sidecar.core.link.datagrams import Batch, LinkIdentity
 from sidecar.core.link.link import Link
+from sidecar.core.link.sender import Batch, LinkIdentity
 from sidecar.core.rules.service_rule import ServiceRule
 from sidecar.core.seam.application import ApplicationEvent, ExecuteRequest, OfferService, ResponseArrived
 from sidecar.core.seam.links import SetReady

@@ -7,8 +7,8 @@ import time
 from typing import TYPE_CHECKING, Any
 
 from protos.model.ids import InterfaceId, InterfaceName, Role
-from sidecar.core.link.datagrams import Batch, LinkIdentity
 from sidecar.core.link.link import Link
+from sidecar.core.link.sender import Batch, LinkIdentity
 from sidecar.net.interface_thread import InterfaceThread
 from tests.support.sessions import credential_of
 

@@ -8,8 +8,8 @@ import pytest
 
 from protos.model.ids import InterfaceId, InterfaceName, NodeName, Role
 from sidecar.core.base.values import PathId, PathState
-from sidecar.core.link.datagrams import LinkIdentity
 from sidecar.core.link.link import Link
+from sidecar.core.link.sender import LinkIdentity
 from sidecar.core.seam.links import PathChanged
 from sidecar.net.interface_thread import InterfaceThread
 from sidecar.net.sources import Sources

@@ -11,7 +11,7 @@ from controlplane.core.estimate.shared_fate import HALF_LIFE_S, SharedFate
 from protos.model.explanation import Correlation
 from protos.model.ids import InterfaceName, ServiceName
 from protos.model.report import InterfaceJointReport
-from sidecar.core.robot.measure.interface_outcomes import InterfacePair, JointCounts, PairOutcome
+from sidecar.core.robot.measure.measurements import InterfacePair, JointCounts, PairOutcome
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

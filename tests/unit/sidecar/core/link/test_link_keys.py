@@ -10,8 +10,8 @@ import pytest
 
 from protos.base.errors import DecodeError
 from protos.model.ids import InterfaceId, NodeName, Role, SessionId
-from sidecar.core.link.datagrams import LinkIdentity
 from sidecar.core.link.link import Link
+from sidecar.core.link.sender import LinkIdentity
 from sidecar.core.path.key_exchange import DEFAULT_LIMITS, EXCHANGES_AT_ONCE
 from sidecar.core.path.keys import make_path_keys
 from sidecar.core.path.pmtu import HEADERS_V4

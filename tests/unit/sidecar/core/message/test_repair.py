@@ -4,13 +4,13 @@ import random
 
 import pytest
 
-from sidecar.core.message.loss_estimate import Loss
 from sidecar.core.message.repair import (
     FAILURES,
     FLOOR,
     MAX_COPIES,
     MAX_RATIO,
     WORTH_A_COPY,
+    Loss,
     repair_symbols,
     worth_a_copy,
 )

@@ -5,8 +5,7 @@ from dataclasses import replace
 import pytest
 
 from protos.model.ids import ServiceName
-from sidecar.core.rules.fallback_rule import FallbackRule
-from sidecar.core.rules.service_rule import MAX_FOUND, Rules
+from sidecar.core.rules.service_rule import MAX_FOUND, FallbackRule, Rules
 from tests.support.builders import rule
 
 RULES = (rule("/arm/plan"), rule("/arm/*"), rule("/node/get_parameters"), rule("/*"))

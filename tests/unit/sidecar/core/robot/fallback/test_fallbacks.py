@@ -11,8 +11,7 @@ import pytest
 from protos.model.ids import ServiceName
 from sidecar.core.robot.fallback import fallbacks, queue
 from sidecar.core.robot.fallback.fallbacks import Accepted, Fallbacks
-from sidecar.core.rules.fallback_rule import FallbackRule
-from sidecar.core.rules.service_rule import ServiceRule
+from sidecar.core.rules.service_rule import FallbackRule, ServiceRule
 from sidecar.core.seam.application import RequestFailed
 from tests.support.builders import request_id
 

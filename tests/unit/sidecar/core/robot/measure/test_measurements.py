@@ -12,8 +12,7 @@ from protos.model.report import MAX_PATHS, InterfaceJointReport, JointReport, Ou
 from sidecar.core.base.report_scope import ReportScope
 from sidecar.core.base.values import PathState
 from sidecar.core.robot.measure import measurements as measurements_module
-from sidecar.core.robot.measure.interface_outcomes import InterfacePair, PairOutcome
-from sidecar.core.robot.measure.measurements import Measurements
+from sidecar.core.robot.measure.measurements import InterfacePair, Measurements, PairOutcome
 from sidecar.core.robot.request.request import Carried
 from sidecar.core.seam.links import PathMeasured
 from sidecar.core.transfer.routes import Routes

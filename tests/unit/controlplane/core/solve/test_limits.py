@@ -7,7 +7,7 @@ import random
 import pytest
 
 from controlplane.core.problem.problem import FleetKey, Problem
-from controlplane.core.solve.grouping import independent_groups
+from controlplane.core.solve.limits import independent_groups
 from protos.model.ids import NodeName
 from tests.unit.controlplane.problems import PLAN, best_price, block, random_problem
 

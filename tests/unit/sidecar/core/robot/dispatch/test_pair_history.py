@@ -5,8 +5,8 @@ from __future__ import annotations
 import pytest
 
 from sidecar.core.base.values import PathState
-from sidecar.core.robot.dispatch import path_pace
-from sidecar.core.robot.dispatch.path_pace import FADE_S, PathPaces
+from sidecar.core.robot.dispatch import pair_history
+from sidecar.core.robot.dispatch.pair_history import FADE_S, PathPaces
 from sidecar.core.seam.stats import EngineStats
 from sidecar.core.transfer.routes import Routes
 from tests.support.builders import ECHO, WLAN, WWAN, A, B, path
@@ -53,7 +53,7 @@ def test_a_pair_never_tried_is_taken_for_as_fast_as_another(paces: PathPaces) ->
 
 
 def test_pairs_are_forgotten_in_order(paces: PathPaces, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(path_pace, "MAX_PACES", 1)
+    monkeypatch.setattr(pair_history, "MAX_PACES", 1)
     paces.answered(ECHO, WLAN_A, 0.1, 0.02, 0.0)
     paces.answered(ECHO, WWAN_B, 0.2, 0.03, 0.0)
     assert paces.processing_s(ECHO, WLAN_A) == 0.0

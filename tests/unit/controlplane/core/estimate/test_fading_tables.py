@@ -7,7 +7,7 @@ import pytest
 from controlplane.core.control.control import ControlCore
 from controlplane.core.control.events import Settings
 from controlplane.core.estimate.estimator import Estimator
-from controlplane.core.estimate.forgetting import FORGET_S, forget_after_s
+from controlplane.core.estimate.fading import FORGET_S, forget_after_s
 from controlplane.core.estimate.processing import ComputeTimes
 from controlplane.core.publish.messages import CloseReason
 from controlplane.core.registry.registry import Refusal

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from sidecar.core.base.timers import NEVER
-from sidecar.core.path.turn import PATIENCE, SMALL, Turn
+from sidecar.core.path.send_queue import PATIENCE, SMALL, Turn
 from tests.support.builders import message, path
 
 if TYPE_CHECKING:

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from sidecar.core.robot.measure.deadline_outcomes import measure_outcomes
 from sidecar.core.robot.measure.measurements import Measurements
+from sidecar.core.robot.measure.outcomes import measure_outcomes
 from sidecar.core.robot.request.request import Copy, CopyState, Request
 from sidecar.core.rules.service_rule import ServiceRule
 from sidecar.core.transfer.routes import Routes

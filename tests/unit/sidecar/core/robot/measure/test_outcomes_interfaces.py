@@ -9,7 +9,7 @@ import pytest
 from protos.model.redundancy_mode import RedundancyMode
 from sidecar.core.base.request_id import OBSERVED_ONE_IN
 from sidecar.core.base.values import PathState
-from sidecar.core.robot.measure.interface_outcomes import interface_outcomes
+from sidecar.core.robot.measure.outcomes import interface_outcomes
 from sidecar.core.robot.request.request import Copy, CopyState, Request
 from sidecar.core.rules.service_rule import ServiceRule
 from sidecar.core.transfer.routes import Routes

@@ -4,8 +4,7 @@ import random
 
 import pytest
 
-from sidecar.core.message.loss_estimate import MAX_DISPERSION, LossEstimate
-from sidecar.core.message.repair import FLOOR
+from sidecar.core.message.repair import FLOOR, MAX_DISPERSION, LossEstimate
 
 
 def measured(rng: random.Random, share: float, windows: int, *, burst: int = 1, size: int = 130) -> LossEstimate:

@@ -1,0 +1,174 @@
+"""Remembers how each pair of an interface and a server answered lately.
+
+`PathPace` keeps the current latency of a pair, `PathRecords` the outcomes of its last copies.
+
+Pace: two averages stand beside each other. The current one moves half of the way with each answer; the usual one moves
+slowly. The current one fades into the usual one. A copy that has been awaited for longer than both shows that its pair
+is slow now, long before it is answered.
+
+Records: a copy that was called off is known to have taken longer than until then. For a quantile below that moment this
+is as good as the latency itself, and no hedge is sent before the quantile it waits for: so the delay of hedges stays
+true although most slow copies are called off. Which pair misses least follows from measured requests only
+(`Request.observed`).
+"""
+
+from __future__ import annotations
+
+import math
+from collections import OrderedDict, deque
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, NamedTuple
+
+from sidecar.core.robot.request.request import CopyState
+
+if TYPE_CHECKING:
+    from protos.model.ids import InterfaceName, NodeName, ServiceName
+    from sidecar.core.base.values import PathId
+    from sidecar.core.robot.request.request import Copy, Request
+    from sidecar.core.seam.stats import EngineStats
+    from sidecar.core.transfer.routes import Routes
+
+MAX_PACES = 4096
+"""Pairs remembered, each for one service; then the one that was used longest ago goes."""
+PRESENT_GAIN = 0.5
+USUAL_GAIN = 1 / 16
+FADE_S = 2.0
+"""In which half of what sets the present apart from the usual is forgotten: so long lasts a bad spot on a road."""
+
+
+class _Key(NamedTuple):
+    service: ServiceName
+    interface: InterfaceName
+    server: NodeName
+
+
+@dataclass(slots=True)
+class _Pace:
+    present_s: float
+    usual_s: float
+    processing_s: float
+    noted_at: float
+
+    def expected_s(self, now: float) -> float:
+        faded = math.pow(0.5, (now - self.noted_at) / FADE_S)
+        return self.usual_s + (self.present_s - self.usual_s) * faded
+
+
+class PathPaces:
+    """The pace of each pair, by service: its requests are taken to be alike in size."""
+
+    def __init__(self, routes: Routes, stats: EngineStats) -> None:
+        self._routes = routes
+        self._stats = stats
+        self._paces: OrderedDict[_Key, _Pace] = OrderedDict()
+
+    def answered(self, service: ServiceName, path: PathId, latency_s: float, processing_s: float, now: float) -> None:
+        """A copy was answered `latency_s` after it was sent, `processing_s` of which was the server's."""
+        key = _Key(service, path.interface, path.peer)
+        pace = self._paces.get(key)
+        if pace is None:
+            self._paces[key] = _Pace(latency_s, latency_s, processing_s, now)
+            if len(self._paces) > MAX_PACES:
+                self._paces.popitem(last=False)
+                self._stats.dropped["path_paces_full"] += 1
+            return
+        self._paces.move_to_end(key)
+        expected_s = pace.expected_s(now)
+        pace.present_s = expected_s + PRESENT_GAIN * (latency_s - expected_s)
+        pace.usual_s += USUAL_GAIN * (latency_s - pace.usual_s)
+        pace.processing_s += PRESENT_GAIN * (processing_s - pace.processing_s)
+        pace.noted_at = now
+
+    def takes_at_least(self, service: ServiceName, path: PathId, latency_s: float, now: float) -> None:
+        """A copy that is not answered yet will not be before this latency, as it seems."""
+        pace = self._paces.get(_Key(service, path.interface, path.peer))
+        if pace is not None and latency_s > pace.expected_s(now):
+            pace.present_s = latency_s
+            pace.noted_at = now
+
+    def expected_s(self, service: ServiceName, path: PathId, now: float) -> float | None:
+        """What the next answer over this pair takes, in seconds; None when nothing is known of the service.
+
+        A pair that has answered nothing yet is taken for as fast as the fastest other, as far as the networks' round
+        trips are alike.
+        """
+        pace = self._paces.get(_Key(service, path.interface, path.peer))
+        if pace is not None:
+            return pace.expected_s(now)
+        others = (
+            (other.usual_s, self._routes.best_over(key.interface, key.server))
+            for key, other in self._paces.items()
+            if key.service == service
+        )
+        mine = self._routes.rtt(path)
+        guesses = [usual_s + max(0.0, mine - route.smoothed_rtt_s) for usual_s, route in others if route is not None]
+        return min(guesses, default=None)
+
+    def processing_s(self, service: ServiceName, path: PathId) -> float:
+        """What the server needs of that, in seconds; 0 while it has not answered."""
+        pace = self._paces.get(_Key(service, path.interface, path.peer))
+        return 0.0 if pace is None else pace.processing_s
+
+
+WINDOW = 128
+"""Copies remembered for each pair: enough for a quantile of 0.99, see `quantile_s`."""
+MAX_AGE_S = 120.0
+"""A road is another one after so long: older copies tell nothing."""
+MAX_RECORDS = 4096
+"""Pairs remembered, each for one service; then the one that was used longest ago goes."""
+PRIOR_COPIES, PRIOR_MISSES = 10.0, 0.5
+"""What is believed of a pair before anything is known: one in twenty misses. A pair that misses more often than that
+loses its place to one never tried, a better one does not."""
+
+
+class _Sample(NamedTuple):
+    at: float
+    latency_s: float
+    """At least, if it was called off; infinite if it missed the deadline."""
+    measured: bool
+
+
+class PathRecords:
+    """The last copies of each pair."""
+
+    def __init__(self, stats: EngineStats) -> None:
+        self._stats = stats
+        self._samples: OrderedDict[_Key, deque[_Sample]] = OrderedDict()
+
+    def note(self, request: Request, now: float) -> None:
+        """Remember what became of a request's copies, once, when its deadline is over or every copy has ended."""
+        for copy in request.started_together():
+            if copy.state is not CopyState.REJECTED:
+                self._add(request, copy, now)
+
+    def _add(self, request: Request, copy: Copy, now: float) -> None:
+        key = _Key(request.service, copy.path.interface, copy.path.peer)
+        samples = self._samples.get(key)
+        if samples is None:
+            samples = self._samples[key] = deque(maxlen=WINDOW)
+            if len(self._samples) > MAX_RECORDS:
+                self._samples.popitem(last=False)
+                self._stats.dropped["path_records_full"] += 1
+        self._samples.move_to_end(key)
+        known = copy.ended_at is not None and (copy.in_time or copy.state is CopyState.DEAD)
+        latency_s = copy.ended_at - copy.sent_at if known and copy.ended_at is not None else math.inf
+        samples.append(_Sample(now, latency_s, request.observed))
+
+    def _recent(self, service: ServiceName, path: PathId, now: float) -> list[_Sample]:
+        samples = self._samples.get(_Key(service, path.interface, path.peer), ())
+        return [sample for sample in samples if sample.at >= now - MAX_AGE_S]
+
+    def miss_share(self, service: ServiceName, path: PathId, now: float) -> float:
+        """What share of its copies the pair is expected to bring back late or never."""
+        measured = [sample.latency_s for sample in self._recent(service, path, now) if sample.measured]
+        return (measured.count(math.inf) + PRIOR_MISSES) / (len(measured) + PRIOR_COPIES)
+
+    def quantile_s(self, service: ServiceName, path: PathId, quantile: float, now: float) -> float | None:
+        """Seconds within which the next copy is answered with at least this probability; None if too few are known.
+
+        Among n latencies alike the next one is at most the k-th smallest with probability k / (n + 1), whatever their
+        distribution: for 0.95 nineteen are needed. Infinite where the pair misses more often than that.
+        """
+        latencies = sorted(sample.latency_s for sample in self._recent(service, path, now))
+        rank = math.ceil(quantile * (len(latencies) + 1))
+        return latencies[rank - 1] if rank <= len(latencies) else None
