@@ -159,7 +159,7 @@ class _Trial:
         for one in told:
             text = ", ".join(one.firing) or "resolved"
             _say(f"notification to {one.receiver}: {text} {' '.join(one.links)}".rstrip())
-            if not all(link.startswith(f"{self._monitoring.pages}/runbook.md#") for link in one.links):
+            if not all(link.startswith(f"{self._monitoring.pages}/operate/runbook.md#") for link in one.links):
                 raise MonitoringError("a runbook_url leads nowhere")
         _say(f"{len(told)} notifications; alerts in Prometheus: {dict(pending)}")
         return [text for one in told for text in one.firing]

@@ -261,7 +261,7 @@ def test_each_alert_has_a_section_in_the_runbook_and_each_section_an_alert() -> 
     assert sorted(sections) == sorted(rule["alert"] for rule in alerts())
     for rule in alerts():
         page, _, anchor = rule["annotations"]["runbook_url"].partition("#")
-        assert page == "{{ $externalLabels.plr_docs }}/" + RUNBOOK.name
+        assert page == "{{ $externalLabels.plr_docs }}/operate/" + RUNBOOK.name
         assert anchor == rule["alert"].lower()
     texts = re.split(r"^### ", RUNBOOK.read_text(), flags=re.MULTILINE)[1:]
     assert [text.split()[0] for text in texts if not re.search(r"Meaning.*Look at.*Do\.", text, re.DOTALL)] == []

@@ -3,7 +3,7 @@
 The control plane says which pair of an interface and a server would teach it most (`ServiceMapping.explore`); what it
 learns there is of real requests, which probes are no match for. Where a service's `RedundancyMode` or a budget leaves
 out mapped pairs, these take turns with it. The copy is never in place of a mapped one, and goes
-only beside requests whose copies are all measured anyway (`copies.OBSERVED_ONE_IN`), so that what is measured stays
+only beside requests whose copies are all measured anyway (`OBSERVED_ONE_IN`), so that what is measured stays
 unbiased: which request that is depends on its id, nothing else.
 """
 
@@ -36,7 +36,7 @@ MAX_REQUEST_BYTES = 128 * 1024
 """Larger requests are not worth it. A service costs at most 1.6 MB a minute more."""
 
 MAX_MAPPED_COPIES = 4
-"""A request with more copies gets none besides: half of `dispatching.MAX_COPIES`, the rest is for trouble."""
+"""A request with more copies gets none besides: half of `dispatcher.MAX_COPIES`, the rest is for trouble."""
 
 MAX_WAITING_MESSAGES = 4
 """An interface with more undelivered messages is busy: a copy that need not be would hold others up."""
