@@ -77,8 +77,11 @@ def test_a_server_that_was_mended_is_mapped_again() -> None:
     fleet.call(FIRST_S + 30.0)
     assert "PENALTY" not in fleet.explained(fleet.robot)
     assert "can not be delivered" not in fleet.mapping(fleet.robot).reason
-    fleet.call(LONGEST_S)
-    assert "cloud-a" in fleet.servers(fleet.robot)
+    for _ in range(int(LONGEST_S / 20)):
+        fleet.call(20.0)
+        if "cloud-a" in fleet.servers(fleet.robot):
+            return
+    pytest.fail("it is mapped again within the longest penalty")
 
 
 def test_the_only_server_stays_mapped() -> None:

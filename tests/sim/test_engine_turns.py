@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
     from types import FrameType
 
-REQUESTS, CLOUDS, SERVICES = 1000, 50, 400
+REQUESTS, CLOUDS, SERVICES = 1000, 25, 400
 """What a turn does must not depend on the first of them."""
 MAX_CALLS = 25_000
 ENTRIES = ("on_link_event", "handle_timer", "apply_peers", "set_interfaces", "submit", "take_report", "complete")
