@@ -12,7 +12,7 @@ unexport ROS_DISTRO ROS_VERSION ROS_PYTHON_VERSION _ROS_WHEELS_BOOTSTRAP_COMPLET
 # Nothing that we start announces itself to the network.
 export ROS_AUTOMATIC_DISCOVERY_RANGE ?= LOCALHOST
 
-.PHONY: help setup demo test fuzz lint format protos interfaces lock bench bench-quick bench-dataplane bench-churn bench-insiders bench-control bench-fleet-day bench-matcher clean distclean
+.PHONY: help setup demo test quick fuzz lint format protos interfaces lock bench bench-quick bench-dataplane bench-churn bench-insiders bench-control bench-fleet-day bench-matcher clean distclean
 
 help: ## this list
 	@echo 'usage: make TARGET'
@@ -32,6 +32,9 @@ demo: setup ## a robot keeps its deadline while a link, a server and the control
 
 test: setup ## all tests
 	@deploy/dev/test.sh $(PYTEST_ARGS)
+
+quick: setup ## what changed since COMMIT=main: lint, its unit tests, a slice of the simulations (a minute)
+	@deploy/dev/quick.sh $(COMMIT)
 
 fuzz: setup ## a million junk datagrams for each fuzzing test (10 minutes, as root)
 	@$(PY) -m pytest tests/fuzz tests/attacks/test_fuzz.py --fuzz-datagrams 1000000 $(PYTEST_ARGS)

@@ -24,8 +24,8 @@ for file in "${sources[@]}"; do
   esac
   compgen -G "$folder/test_*.py" >/dev/null && folders[$folder]=1
 done
-# Whole requests through both cores: replication, loss, a dead path, the mapping.
-slice=(tests/sim/test_requests.py tests/sim/test_redundancy_modes.py tests/sim/test_control_plane.py)
+# Whole requests through both cores, and from reports to a mapping that is explained.
+slice=(tests/sim/test_hedging.py tests/sim/test_dual_stack.py tests/sim/test_explain.py)
 
 status=0
 if ((${#sources[@]})); then

@@ -1,6 +1,6 @@
 """Remembers how each pair of an interface and a server answered lately.
 
-`PathPace` keeps the current latency of a pair, `PathRecords` the outcomes of its last copies.
+`PathPaces` keeps the current latency of a pair, `PathRecords` the outcomes of its last copies.
 
 Pace: two averages stand beside each other. The current one moves half of the way with each answer; the usual one moves
 slowly. The current one fades into the usual one. A copy that has been awaited for longer than both shows that its pair
