@@ -23,7 +23,7 @@ from protos.trust.identity import IdentityRole
 if TYPE_CHECKING:
     from controlplane.ca import Authority
 
-UNIT = Path("deploy/systemd/plr-controlplane.serve.service")
+UNIT = Path("deploy/systemd/plr-controlplane.service")
 USUAL_OPEN_FILES = 1024
 """What systemd gives to a unit that does not say."""
 PATIENCE_S = 30.0

@@ -135,7 +135,7 @@ def host(tmp_path: Path) -> Path:
 
 
 def test_there_is_a_unit_for_each_program() -> None:
-    assert [unit.name for unit in UNITS] == ["plr-controlplane.serve.service", "plr-sidecar.service"]
+    assert [unit.name for unit in UNITS] == ["plr-controlplane.service", "plr-sidecar.service"]
 
 
 def test_systemd_understands_the_units(host: Path) -> None:

@@ -5,9 +5,9 @@ from __future__ import annotations
 import pytest
 
 from protos.model.ids import InterfaceName, NodeName
+from sidecar.core.base import request_id as identity
 from sidecar.core.base.request_id import OBSERVED_ONE_IN
 from sidecar.core.base.values import PathState
-from sidecar.core.robot.request import request
 from tests.sim.serial_server import SerialServer
 from tests.sim.test_mesh import assert_at_most_once, assert_each_answered_once, call_at, mapped, two_by_two
 from tests.support.mesh import SERVICE, Mesh, Node
@@ -35,7 +35,7 @@ def carried_by_a_slow_loser() -> int:
 
 def test_a_slow_path_carries_little_of_what_it_cannot_win(monkeypatch: pytest.MonkeyPatch) -> None:
     with monkeypatch.context() as always:
-        always.setattr(request, "OBSERVED_ONE_IN", 1)
+        always.setattr(identity, "OBSERVED_ONE_IN", 1)
         races_only = carried_by_a_slow_loser()
     assert carried_by_a_slow_loser() < 0.7 * races_only
 
