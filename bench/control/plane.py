@@ -18,6 +18,7 @@ from urllib.request import urlopen
 import yaml
 
 from bench.churn.machine import processor_s
+from lab.host import DIE_WITH_PARENT
 from protos.trust.identity import IdentityRole
 
 if TYPE_CHECKING:
@@ -99,7 +100,7 @@ class Plane:
 
     def _start(self, module: str, *arguments: str) -> float:
         limit = min(open_files_of(UNIT), resource.getrlimit(resource.RLIMIT_NOFILE)[1])
-        command = [sys.executable, "-m", module, *arguments]
+        command = [*DIE_WITH_PARENT, sys.executable, "-m", module, *arguments]
         began = time.monotonic()
         with (self._folder / "controlplane.log").open("ab") as log:
             self._process = subprocess.Popen(command, stdout=log, stderr=log, env=self._environment)
