@@ -1,4 +1,4 @@
-"""One path: what its interface's thread owns of it, without a lock.
+"""Holds the state of one path, which its interface's thread owns without a lock.
 
 Imports `base`, `crypto`, `wire`, `message`, `seam` and its own `congestion`; nothing of the engine's half (ADR 4).
 """

@@ -1,4 +1,4 @@
-"""Since when each path of one interface is as it is, and why: what was last told of it, for people."""
+"""Remembers since when and why each path of one interface has its state, for people."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ if TYPE_CHECKING:
     from sidecar.core.seam.links import PathChanged
 
 MAX_REMEMBERED = 4096
-"""Paths of one interface, those of peers that left included; then the one that changed longest ago goes."""
+"""Paths remembered per interface, those of departed peers included. Beyond it the one that changed longest ago goes."""
 
 
 class Change(NamedTuple):
@@ -24,15 +24,15 @@ class Change(NamedTuple):
 
 
 class PathHistory:
-    """One thread notes, any may ask."""
+    """The last change of each path. One thread writes, any may read."""
 
     def __init__(self, drops: Counter[str]) -> None:
-        """What is forgotten for want of room is counted into `drops`."""
+        """Entries dropped for lack of room are counted into `drops`."""
         self._drops = drops
         self._last: dict[PathId, Change] = {}
 
     def note(self, event: PathChanged, now: float) -> None:
-        """A path's liveness is told; it may be what was told before."""
+        """Note a reported liveness; it may repeat the last one."""
         before = self._last.get(event.path)
         if before is not None and before.state is event.state:
             return
@@ -43,7 +43,7 @@ class PathHistory:
             self._drops["path_history_full"] += 1
 
     def all(self) -> dict[PathId, Change]:
-        """Return the last change of each path, those of peers that left included."""
+        """Return the last change of each path, those of departed peers included."""
         return self._last.copy()
 
     def last(self, path: PathId) -> Change | None:

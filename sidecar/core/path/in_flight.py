@@ -1,4 +1,4 @@
-"""Runs of datagrams in flight: consecutive packet numbers that left together, noted as one."""
+"""Represents runs of datagrams in flight: consecutive packet numbers that left together, noted as one."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ class Sent(NamedTuple):
     last: int
     """Bytes of the last datagram."""
     message: OutboundMessage | None = None
-    """What symbols they carry, one each, in order."""
+    """The message whose symbols they carry, one each, in order."""
     symbol: int = 0
     """The first symbol."""
     finished: tuple[int, ...] = ()
-    """The messages that they report FINISHED; then it is one datagram."""
+    """The messages that it reports FINISHED; a run that reports any is a single datagram."""
 
     @property
     def end(self) -> int:
@@ -33,7 +33,7 @@ class Sent(NamedTuple):
 
     @property
     def size(self) -> int:
-        """Bytes of all of them."""
+        """Total bytes."""
         return self.segment * (self.datagrams - 1) + self.last
 
     @property
@@ -47,7 +47,7 @@ class Sent(NamedTuple):
         return self.segment if self.datagrams > 1 else self.last
 
     def within(self, shortest: int, longest: int) -> int:
-        """How many of the datagrams have so many bytes."""
+        """Count the datagrams of `shortest` to `longest` bytes."""
         others = self.datagrams - 1 if shortest <= self.segment <= longest else 0
         return others + (shortest <= self.last <= longest)
 

@@ -1,14 +1,14 @@
-"""Fresh keys for one path, again and again: the exchange behind each phase (in the spirit of Noise IK and WireGuard).
+"""Agrees on fresh keys for each phase of one path (in the spirit of Noise IK and WireGuard).
 
-The end that leads offers a new public key, with a proof that it knows the keys in use; the other answers with one of
-its own, and with a proof that it could compute what follows from both and from the two sessions' keys
-(key_schedule.py). The new private keys are forgotten with the exchange. So what is read from memory one day opens
-nothing that was sealed a phase earlier, and who stole one end's session key can not play the other end to it.
+The leading end offers a new public key, with a proof that it knows the keys in use. The other end answers with a public
+key of its own, and with a proof that it could compute the result of both keys and of the two sessions' keys
+(key_schedule.py). The new private keys are forgotten with the exchange. So memory read one day opens nothing that was
+sealed a phase earlier, and a thief of one end's session key cannot impersonate the other end to it.
 
-The offer travels with the probes and introductions until it is answered, and is the same each time; the same offer has
-the same answer. The leader goes on with the new keys when it has the answer, the other end when something opens with
-them. A path has no phase before the first (`phase` 0) but the one that follows from the sessions' keys alone: it
-carries nothing but probes and this exchange.
+The offer travels with the probes and introductions until it is answered, and stays the same; the same offer gets the
+same answer. The leader switches to the new keys when it has the answer, the other end when something opens with them.
+Before its first exchange a path is in phase 0, whose keys follow from the sessions' keys alone: it carries nothing but
+probes and this exchange.
 """
 
 from __future__ import annotations
@@ -31,32 +31,33 @@ if TYPE_CHECKING:
     from sidecar.core.crypto.key_schedule import PairKeys
 
 RENEW_AFTER_S = 120.0
-"""Age of a phase at which the next one is offered: as WireGuard does."""
+"""Age of a phase at which the next one is offered, as in WireGuard."""
 RENEW_AFTER_DATAGRAMS = 1 << 21
-"""Datagrams of one phase, either way, after which the next one is offered: by the next probe, half a second later."""
+"""Datagrams of one phase, either way, after which the next one is offered, with the next probe, half a second later."""
 MAX_PHASE = 0xFFFFFFFF
-"""The last one that an offer can name: two minutes each, some 16,000 years."""
+"""The last phase that an offer can name: at two minutes each, some 16,000 years."""
 MAX_SEALED = 1 << 23
 """Datagrams that one phase seals (RFC 9001 section 6.6, for AES-GCM and the longest). A peer that agrees on no new keys
-until then gets nothing but probes."""
+by then gets nothing but probes."""
 WAITS_SHARE, WAITS_S = 8.0, 15.0
-"""Where requests prove that a path lives, no probe leaves: an offer that is due waits so much of a phase's age, and no
-longer than this, for a probe to ride on, and then has one of its own."""
+"""Where requests prove that a path lives, no probe leaves. A due offer then waits this share of a phase's age, at most
+this long, for a probe to ride on, and after that gets its own."""
 AGAIN_S = 1.0
-"""As long for one that was sent and not answered."""
+"""The same wait for an offer that was sent and not answered."""
 OTHER_OFFER_AFTER_S = 1.0
-"""An honest leader repeats its offer: another one before this costs us nothing, and it nothing but time."""
+"""Least time between two different offers that are answered. An honest leader repeats its offer: ignoring another one
+costs us nothing, and the leader only time."""
 
 
 EXCHANGES_PER_S = 10.0
-"""Exchanges worked on for all paths of a link to one peer: each is 0.3 ms of public-key work for a datagram of some
+"""Rate of exchanges processed for all paths to one peer: each costs 0.3 ms of public-key work per datagram of some
 hundred bytes. An honest peer needs one for each path every two minutes, ..."""
 EXCHANGES_AT_ONCE = 64.0
 """... or for all its paths at once, after a restart."""
 
 
 class TooManyExchangesError(DecodeError):
-    """The peer asks for more exchanges than are worked on."""
+    """The peer asks for more exchanges than are processed."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,7 +74,7 @@ DEFAULT_LIMITS = KeyLimits()
 
 @dataclass(slots=True)
 class _Exchange:
-    """One that is not over: the leader's offer, or the other end's answer to it."""
+    """A pending exchange: the leader's offer, or the other end's answer to it."""
 
     offer: KeyOffer
     began_at: float
@@ -82,7 +83,7 @@ class _Exchange:
     """The leader's."""
     answer: KeyAnswer | None = None
     root: bytes = field(default=b"", repr=False)
-    """What the answer agrees on."""
+    """The root that the answer agrees on."""
 
 
 class KeyExchange:
@@ -98,7 +99,7 @@ class KeyExchange:
         self._changed_at = now
         self._exchange: _Exchange | None = None
         self.phase = 0
-        """The one that we seal with."""
+        """The phase that we seal with."""
 
     @property
     def changed_at(self) -> float:
@@ -108,7 +109,7 @@ class KeyExchange:
     # -- the end that leads ---------------------------------------------------------------------------------------
 
     def offers_at(self, datagrams: int) -> float:
-        """Return when a probe leaves for an offer's sake (s); `datagrams`: of this phase, either way."""
+        """Return when a probe leaves just to carry an offer (s); `datagrams`: of this phase, either way."""
         if not self._leads:
             return math.inf
         if self._exchange is not None:
@@ -118,7 +119,7 @@ class KeyExchange:
         return self._changed_at + self._limits.seconds + min(self._limits.seconds / WAITS_SHARE, WAITS_S)
 
     def offer(self, datagrams: int, now: float, rng: random.Random) -> KeyOffer | None:
-        """Return what to offer with the next probe, if new keys are due; `datagrams`: of this phase, either way."""
+        """Return the offer for the next probe, if new keys are due; `datagrams`: of this phase, either way."""
         if not self._leads:
             return None
         if self._exchange is None:
@@ -133,12 +134,12 @@ class KeyExchange:
         return self._exchange.offer
 
     def take(self, answer: KeyAnswer, now: float, budget: TokenBucket | None = None) -> bytes | None:
-        """Return the new root that an answer completes; None if it answers nothing that is asked.
+        """Return the new root that an answer completes; None if it answers no pending offer.
 
-        `budget` holds how many may be worked on; None: as many as come.
+        `budget` limits how many exchanges are processed; None: no limit.
 
         Raises:
-            DecodeError: it is not of one who has the peer's session key.
+            DecodeError: the sender does not have the peer's session key.
             TooManyExchangesError: the budget is spent.
         """
         exchange = self._exchange
@@ -164,10 +165,10 @@ class KeyExchange:
     ) -> tuple[KeyAnswer, bytes] | None:
         """Return the answer to an offer, and the root to expect from now on; None if it is not answered.
 
-        `budget` as of `take`.
+        `budget`: see `take`.
 
         Raises:
-            DecodeError: it is not of one who knows the keys in use, or its key is of small order.
+            DecodeError: the sender does not know the keys in use, or its key is of small order.
             TooManyExchangesError: the budget is spent.
         """
         if self._leads or offer.phase != self.phase + 1:
@@ -191,11 +192,11 @@ class KeyExchange:
 
     @property
     def has_answered(self) -> bool:
-        """Whether the leader may have gone on with what our answer agreed on."""
+        """Whether the leader may have switched to the keys that our answer agreed on."""
         return self._exchange is not None and self._exchange.answer is not None
 
     def confirmed(self, now: float) -> bytes:
-        """The leader seals with what our answer agreed on: return its root, and go on with it."""
+        """Switch to the root that our answer agreed on, since the leader seals with it, and return it."""
         assert self._exchange is not None
         root = self._exchange.root
         self._begin(root, now)

@@ -1,12 +1,12 @@
-"""Keys of one path: sealing what leaves, opening what comes, and their phases.
+"""Seals and opens the datagrams of one path, and changes its keys from phase to phase.
 
-Bit 1 of the flags is the phase's parity. The receiver holds the keys in use, those before for what is late, and the
-next ones as soon as they are agreed on (key_exchange.py): it follows with the first datagram that opens with these, so
-that nothing pauses.
+Bit 1 of the flags is the phase's parity. The receiver holds the current keys, the previous ones for late datagrams, and
+the next ones as soon as they are agreed on (key_exchange.py). It switches with the first datagram that opens with the
+next ones, so that nothing pauses.
 
-The nonce is the last 12 of the 20 clear bytes: half of the sender's session, and the packet number, which never
-repeats within a session. A path's keys belong to one session, path and direction (`key_schedule.py`), so no nonce
-repeats under a key. What a path numbered and opened outlives it (`memory.py`).
+The nonce is the last 12 of the 20 clear bytes: half of the sender's session, and the packet number, which never repeats
+within a session. A path's keys belong to one session, path and direction (`key_schedule.py`), so no nonce repeats under
+a key. The packet numbers that a path used and opened outlive it (`memory.py`).
 """
 
 from __future__ import annotations
@@ -38,10 +38,10 @@ if TYPE_CHECKING:
 _PHASE = PHASE_FLAG << 16
 """The phase bit in the first four clear bytes as one number."""
 LATE_S = 10.0
-"""The keys before are dropped so long after something opened with the next ones: what else was sealed with them has
-arrived, or never will."""
+"""The previous keys are dropped this long after something opened with the next ones: whatever else they sealed has
+arrived by then, or never will."""
 MAX_FAILED = 1 << 36
-"""Datagrams that fail one phase's keys before these open nothing any more (RFC 9001 section 6.6, the lower limit)."""
+"""Datagrams that fail one phase's keys before these stop opening anything (RFC 9001 section 6.6, the lower limit)."""
 
 
 class SealingKeys:
@@ -54,13 +54,13 @@ class SealingKeys:
         self.phase = 0
         """Counts the changes of keys."""
         self.head = head
-        """The first four clear bytes of what is sealed now, as one number."""
+        """The first four clear bytes of the datagrams sealed now, as one number."""
         self.sealed = 0
-        """Datagrams of this phase."""
+        """Datagrams sealed in this phase."""
         self.encrypt_into = ciphers.make_cipher(aead, key).encrypt_into
 
     def advance(self, key: bytes) -> None:
-        """Go on with the next phase's key."""
+        """Switch to the next phase's key."""
         self.phase += 1
         self.head ^= _PHASE
         self.sealed = 0
@@ -76,22 +76,22 @@ class OpeningKeys:
         self._aead = aead
         self.phase = 0
         self.head = head
-        """The first four clear bytes of datagrams of the phase in use, as one number: `decrypt_into` opens these."""
+        """The first four clear bytes of the current phase's datagrams, as one number: `decrypt_into` opens these."""
         self._current = ciphers.make_cipher(aead, key)
         self.decrypt_into = self._current.decrypt_into
         self.first = 0
-        """The packet number that began the phase in use."""
+        """The packet number that began the current phase."""
         self._previous: Cipher | None = None
         self._next: Cipher | None = None
         self.failed = 0
-        """Datagrams that did not open, in this phase."""
+        """Datagrams of this phase that did not open."""
 
     def expect(self, key: bytes) -> None:
-        """The next phase's key is agreed on."""
+        """Prepare the next phase's key, which has been agreed on."""
         self._next = ciphers.make_cipher(self._aead, key)
 
     def open_other(self, nonce: Buffer, sealed: Buffer, associated_data: Buffer, out: Buffer, /) -> int:
-        """As `decrypt_into`, for a datagram of the other parity than `head`: of the phase before, or of the next."""
+        """Do as `decrypt_into` for a datagram of the other parity than `head`: of the previous or the next phase."""
         # The packet number.
         number = int.from_bytes(nonce[-8:], "big")
         if number < self.first and self._previous is not None:
@@ -103,9 +103,9 @@ class OpeningKeys:
         return size
 
     def advance(self, number: int) -> None:
-        """Go on with the key that is expected, from this packet number on."""
+        """Switch to the expected key, from this packet number on."""
         assert self._next is not None
-        # What was sealed in phase 0 was probes, and anybody with one of the sessions' keys could have sealed it.
+        # Phase 0 sealed only probes, and anybody with one of the sessions' keys could have sealed them.
         self._previous = self._current if self.phase else None
         self.phase += 1
         self.head ^= _PHASE
@@ -115,12 +115,12 @@ class OpeningKeys:
         self.failed = 0
 
     def forget_previous(self) -> None:
-        """What is still sealed with the keys before is not opened any more."""
+        """Stop opening what the previous keys sealed."""
         self._previous = None
 
 
 class PathKeys:
-    """What is known of one path for as long as its peer's session, whatever becomes of the path."""
+    """The keys and numbers of one path. They last as long as the peer's session, whatever becomes of the path."""
 
     __slots__ = (
         "_exchange",
@@ -145,28 +145,28 @@ class PathKeys:
         most: int,
         incarnation: int,
     ) -> None:
-        """`most`: datagrams that one phase seals."""
+        """Create the keys; `most`: datagrams that one phase seals."""
         self._pair = pair
         self._exchange = exchange
         self._most = most
         self._opened_phase = 0
-        """The last one that is known to have opened something."""
+        """The last phase that is known to have opened something."""
         self._forget_at = math.inf
-        """When the keys before that are dropped (s)."""
+        """When the previous keys are dropped (s)."""
         self.sealing = sealing
         self.opening = opening
         self.received = ReceivedPackets()
-        """The packet numbers that came: none is accepted twice."""
+        """The packet numbers that came; none is accepted twice."""
         self.incarnation = incarnation
-        """Of the peer's session: a later session's is larger."""
+        """Incarnation of the peer's session; a later session has a larger one."""
         self.introduced = -1
-        """The largest packet number of the peer's introductions: a smaller one is a replay, or overtaken, ..."""
+        """The largest packet number of the peer's introductions. A smaller one is a replay, was overtaken, ..."""
         self.offered = -1
-        """... or was the peer's own after one that somebody else made up, who knows the token alone: then it is larger
-        than those before that made an offer with a true proof."""
+        """... or is the peer's own, sent after one forged by somebody who knows the token alone. The peer's own is then
+        larger than this, the largest one whose offer had a true proof."""
 
     def copy(self) -> PathKeys:
-        """Return the same, apart from these from now on."""
+        """Return an independent copy."""
         sealing, opening = copy(self.sealing), copy(self.opening)
         other = PathKeys(self._pair, copy(self._exchange), sealing, opening, self._most, self.incarnation)
         other.received = deepcopy(self.received)
@@ -176,30 +176,30 @@ class PathKeys:
 
     @property
     def are_fresh(self) -> bool:
-        """Whether we seal with keys that follow from an exchange and are not worn, so that requests may go."""
+        """Whether the sealing keys come from an exchange and are not worn out, so that requests may go."""
         return self.sealing.phase > 0 and self.sealing.sealed < self._most
 
     @property
     def offers_at(self) -> float:
-        """When a probe leaves for the sake of an offer, if none does before (s)."""
+        """When a probe leaves just to carry an offer, if none does before (s)."""
         if self.opening.phase < self.sealing.phase:
             return math.inf
         return self._exchange.offers_at(self._datagrams())
 
     def offer(self, now: float, rng: random.Random) -> KeyOffer | None:
-        """Return what to offer with the next probe, if new keys are due."""
+        """Return the offer for the next probe, if new keys are due."""
         self._forget_previous(now)
         if self.opening.phase < self.sealing.phase:
             return None  # the peer has not followed yet
         return self._exchange.offer(self._datagrams(), now, rng)
 
     def _datagrams(self) -> int:
-        """Datagrams of this phase, either way: what the peer sealed is about as much as came."""
+        """Return the datagrams of this phase, either way: the peer sealed about as many as came."""
         return max(self.sealing.sealed, self.received.largest - self.opening.first)
 
     @property
     def has_answered(self) -> bool:
-        """Whether the peer may have gone on with keys of which nothing has come yet."""
+        """Whether the peer may have switched to keys that have opened nothing yet."""
         return self._exchange.has_answered
 
     def answer(
@@ -207,8 +207,8 @@ class PathKeys:
     ) -> KeyAnswer | None:
         """Return the answer to an offer, if there is one; raises DecodeError. `budget`: see `KeyExchange.take`."""
         if self.opening.phase > self.sealing.phase:
-            # The peer went on with what it offered, in a datagram that nobody has read (yet). Expected once more, the
-            # same key would open a phase that no exchange agreed on.
+            # The peer switched to the keys it offered, in a datagram that nobody has read (yet). Expected once more,
+            # the same key would open a phase that no exchange agreed on.
             return None
         answered = self._exchange.answer(offer, now, rng, budget)
         if answered is None:
@@ -218,7 +218,7 @@ class PathKeys:
         return answer
 
     def take(self, answer: KeyAnswer, now: float, budget: TokenBucket | None = None) -> bool:
-        """Go on with the keys that an answer completes; False if nothing is asked. Raises DecodeError."""
+        """Switch to the keys that an answer completes; False if it answers no pending offer. Raises DecodeError."""
         root = self._exchange.take(answer, now, budget)
         if root is None:
             return False
@@ -227,7 +227,7 @@ class PathKeys:
         return True
 
     def follow(self, now: float) -> bool:
-        """If something opened with the keys that our answer agreed on, seal with these; True if that is news."""
+        """Seal with the keys that our answer agreed on once something opened with them; True if that is new."""
         if self.opening.phase != self._opened_phase:
             self._opened_phase = self.opening.phase
             self._forget_at = now + LATE_S

@@ -1,4 +1,4 @@
-"""One path: where it leads, and whether it lives."""
+"""Combines the state of one path: where it leads, and whether it lives."""
 
 from __future__ import annotations
 
@@ -27,20 +27,20 @@ if TYPE_CHECKING:
     from sidecar.core.wire.frame import KeyAnswer, KeyOffer
 
 DOWN_FACTOR = 4.0
-"""An unstable path is down after this many times the silence that made it unstable, or the longest that anybody waits
-beyond that, ..."""
+"""An unstable path is down after this many times the silence that made it unstable, or after the longest wait on top of
+that silence if that is sooner, ..."""
 DOWN_FLOOR_S = 0.5
 """... but not before this."""
 DOWN_WAIT_S = 2.0
-"""One whose answers take long is down so much after its next answer is overdue, or after the time that it takes."""
+"""A path with slow answers is down this long after its next answer is overdue, or one answer time after if sooner."""
 INTRODUCER_S = 5.0
-"""Where a peer introduced itself from twice may be where it is to be found, for so long."""
+"""How long a peer that introduced itself twice from an address may still be found there."""
 MAX_RTT_SAMPLES = 512
 """Round-trip times kept between two reports."""
 
 
 class Path:
-    """Sender's and receiver's state of one path. Owned by its link."""
+    """Sender's and receiver's state of one path. Its link owns it."""
 
     __slots__ = (
         "_exchanges",
@@ -94,10 +94,10 @@ class Path:
         *,
         leads: bool,
     ) -> None:
-        """`leads`: this end is the one that keeps the path alive (see `Probing`).
+        """Create the path; `leads`: this end keeps it alive (see `Probing`).
 
-        `unproven` holds what may go to where the peer has never proven to be, in bytes; all its paths share it.
-        `exchanges` holds how many exchanges of keys are worked on; they share it too.
+        `unproven` limits the bytes that go to addresses that the peer has never proven. All paths to that peer share
+        it. `exchanges` limits how many key exchanges are processed; they share it too.
         """
         self.id = path_id
         self.remote_id: InterfaceId = path_id.remote
@@ -112,20 +112,20 @@ class Path:
         self.address = PathAddress()
         self.unproven = unproven
         self.source: str | None = None
-        """Which of our addresses the kernel sends from to there, as far as the driver knows."""
+        """The local address from which the kernel sends there, as far as the driver knows."""
         self.state = PathState.DOWN
         self.recovery = Recovery(first_number, rng)
         self.control = CongestionController()
         self.mtu = PathMtu()
         self.queue = SendQueue()
         self.introductions: list[tuple[Address, int, KeyAnswer | None]] = []
-        """Where the peer introduced itself from, the probe that it wants answered there, and what answers its offer."""
+        """Where the peer introduced itself from, the probe to answer there, and the answer to its offer."""
         self.pending: list[bytes] = []
         """Encoded control frames that wait for the next datagram ..."""
         self.finished: dict[int, None] = {}
-        """... and messages to be reported FINISHED in it ..."""
+        """... and messages to report FINISHED in it ..."""
         self.pending_by = NEVER
-        """... which leaves at this moment (s) at the latest; NEVER when none waits."""
+        """... which leaves by this moment (s); NEVER if none waits."""
         self.pings: list[SentPing] = []
         """Pings that wait to leave."""
         self.probing = Probing(now, rng, leads=leads)
@@ -137,10 +137,10 @@ class Path:
         self._introduced_at = -NEVER
         self._introducer: Address | None = None
         self.renewed_at: float | None = None
-        """When our credential was signed anew, until the peer answers an introduction with it."""
+        """When our credential was renewed, until the peer answers an introduction with it."""
         self._waiting_since: float | None = None
         self._oldest_at = now
-        """When the oldest of what waits for an answer left."""
+        """When the oldest datagram that still waits for an answer left."""
         self._rebound = False
 
     @property
@@ -150,23 +150,23 @@ class Path:
 
     @property
     def remote(self) -> Address | None:
-        """Where it leads: to where the newest authentic datagram came from."""
+        """The source of the newest authentic datagram."""
         return self.address.address
 
     @property
     def family(self) -> int | None:
-        """4 or 6: of the address that it leads to; None while none is known."""
+        """4 or 6, from the remote address; None while that is unknown."""
         return None if self.remote is None else 6 if ":" in self.remote[0] else 4
 
     def leaves_from(self, addresses: Collection[str]) -> bool:
-        """Whether it leaves from one of these, by their family alone if its own address is not known."""
+        """Return whether it leaves from one of these; while its own address is unknown, their families decide."""
         if self.source is not None:
             return self.source in addresses
         return self.family in {6 if ":" in address else 4 for address in addresses}
 
     @property
     def probe_at(self) -> float:
-        """When the next probe leaves (s); NEVER while nothing may."""
+        """When the next probe leaves (s); NEVER while nothing may leave."""
         if self.state is PathState.DOWN:
             return self.probing.at
         if self.goes_to_one and self.address.is_blocked:
@@ -175,23 +175,23 @@ class Path:
 
     @property
     def mtu_probe_at(self) -> float | None:
-        """When the next probe of the path's MTU leaves (s): not to where the peer has not proven to be."""
+        """When the next probe of the path's MTU leaves (s); None while the peer has not proven its address."""
         return self.mtu.timer if self.address.is_proven else None
 
     @property
     def gives_up_address_at(self) -> float | None:
-        """When it leads to where it led before, unless the peer proves to be where it leads now (s)."""
+        """When it returns to its last proven address (s), unless the peer proves the current one."""
         if self.state is PathState.DOWN:
             return None
         return self.address.gives_up_at(self.recovery.rtt.next_answer())
 
     @property
     def goes_to_one(self) -> bool:
-        """Whether probes go to the known address, not to all that may be it: the path is down, or just rebound."""
+        """Whether probes go to the known address only, not to all that may be the peer's as when down or rebound."""
         return self.remote is not None and self.state is not PathState.DOWN and not self._rebound
 
     def destinations(self, now: float, size: int) -> list[Address]:
-        """Where probes of `size` bytes go now that look for the peer."""
+        """Return where probes of `size` bytes that look for the peer go now."""
         introducer = self._introducer if now < self._introduced_at + INTRODUCER_S else None
         others = dict.fromkeys((self.remote, introducer))
         all_of_them = (*(one for one in others if one and one not in self.candidates), *self.candidates)
@@ -205,19 +205,19 @@ class Path:
         return self.unproven.take(now, size)
 
     def keeps_address(self, source: Address) -> bool:
-        """Whether an authentic datagram from another of the peer's known addresses is no reason to go there as well.
+        """Return whether to ignore that an authentic datagram came from another known address of the peer.
 
-        It is none while the present one, known as well, answers. An unknown one means that a NAT forgot the peer, or
-        that somebody else passes on what it sends: to be left as soon as a datagram comes from a known one.
+        That holds while the current address, known as well, answers. An unknown address means that a NAT forgot the
+        peer, or that somebody relays what it sends: leave it as soon as a datagram comes from a known one.
         """
         known = source in self.candidates and self.remote in self.candidates
         return known and self.state is PathState.UP and not self._rebound
 
     def note_introduction(self, source: Address, probe_id: int, answer: KeyAnswer | None, now: float) -> None:
-        """The peer introduced itself from here, and wants a probe answered, and perhaps an offer of keys.
+        """Note that the peer introduced itself from here, wants a probe answered, and perhaps an offer of keys.
 
-        When it does so again although it was answered, it can not read the answer: it does not know yet that we were
-        restarted. Behind a NAT it may be reachable there only, so that our own introduction has to go there too.
+        A peer that repeats it although it was answered cannot read the answer: it does not know yet that we restarted.
+        Behind a NAT it may be reachable there only, so our own introduction has to go there too.
         """
         self.introductions.append((source, probe_id, answer))
         if self.state is PathState.DOWN:
@@ -225,12 +225,12 @@ class Path:
             self._introducer, self._introduced_at = source if again else None, now
 
     def ask(self, now: float, to: Address) -> int:
-        """Return the id of a probe that leaves now to this address and to no other, by plan."""
+        """Return the id of a scheduled probe that leaves now to this address alone."""
         self.waits_for_answer(now)
         return self.probing.ask(now, to, sealed=self.state is not PathState.DOWN)
 
     def offer_keys(self, now: float) -> KeyOffer | None:
-        """Return what to offer with what leaves now, if new keys are due and we lead."""
+        """Return the offer to send now, if new keys are due and we lead."""
         return self.keys.offer(now, self._rng)
 
     def answer_keys(self, offer: KeyOffer, now: float) -> KeyAnswer | None:
@@ -238,11 +238,11 @@ class Path:
         return self.keys.answer(offer, now, self._rng, self._exchanges)
 
     def take_keys(self, answer: KeyAnswer, now: float) -> bool:
-        """Go on with the keys that an answer completes; False if nothing is asked. Raises DecodeError."""
+        """Switch to the keys that an answer completes; False if it answers no pending offer. Raises DecodeError."""
         return self.keys.take(answer, now, self._exchanges)
 
     def plan_probe(self, now: float) -> None:
-        """A probe left: plan the next one."""
+        """Plan the next probe after one left."""
         if self.state is PathState.DOWN:
             self.probing.plan_down(now)
         elif self.state is PathState.UNSTABLE or not self.address.is_proven:
@@ -251,21 +251,21 @@ class Path:
             self.probing.plan_up(now)
 
     def asked(self, now: float) -> None:
-        """The peer probed the path."""
+        """Note that the peer probed the path."""
         if self.state is PathState.UP:
             self.probing.asked(now)
 
     def needed(self, now: float) -> None:
-        """Requests go to the peer: it must be known soon whether this path can carry them."""
+        """Note that requests go to the peer: whether this path can carry them must be known soon."""
         if self.state is PathState.UP:
             self.probing.needed(now)
 
     def hasten_probe(self, now: float) -> None:
-        """It is time to ask again, as far as `Probing.hasten` lets."""
+        """Bring the next probe forward, as far as `Probing.hasten` allows."""
         self.probing.hasten(now, self.recovery.rtt.smoothed)
 
     def start_afresh(self, now: float) -> None:
-        """The way to the peer changed: nothing measured on the old one holds (RFC 9000 section 9.4)."""
+        """Discard what was measured, since the route to the peer changed (RFC 9000 section 9.4)."""
         self.recovery.rtt = RttEstimator()
         self.control = CongestionController()
         self.probing.forget()
@@ -276,7 +276,7 @@ class Path:
             self._waiting_since = self._oldest_at = now
 
     def answered_probe(self, probe_id: int, now: float) -> float | None:
-        """A PROBE_REPLY came: return when what it answers left (s), None when it answers nothing we asked."""
+        """Take a PROBE_REPLY; return when the probe left (s), or None if it answers nothing we asked."""
         probe = self.probing.answered(probe_id, now)
         if probe is None:
             return None
@@ -290,14 +290,14 @@ class Path:
 
     @property
     def control_at(self) -> float:
-        """When control frames leave without company (s); NEVER when none wait, or none may leave."""
+        """When control frames leave on their own (s); NEVER if none wait or none may leave."""
         if self.address.is_blocked:
             return NEVER
         ack_at = self.received.ack_at
         return self.pending_by if ack_at is None else min(ack_at, self.pending_by)
 
     def take_control(self, now: float) -> list[bytes]:
-        """Remove and return the control frames that wait, the acknowledgement that is owed included."""
+        """Remove and return the waiting control frames, including the acknowledgement that is owed."""
         taken, self.pending = self.pending, []
         taken += [encode_finished(Finished(number)) for number in self.take_pending_finished()]
         if self.received.ack_at is not None:
@@ -306,7 +306,7 @@ class Path:
         return taken
 
     def take_pending_finished(self) -> tuple[int, ...]:
-        """Return which messages are to be reported FINISHED, and forget it."""
+        """Remove and return the messages to report FINISHED."""
         finished = tuple(self.finished)
         self.finished.clear()
         return finished
@@ -317,7 +317,7 @@ class Path:
             self.rtts.append(self.recovery.rtt.latest)
 
     def take_measured(self) -> PathMeasured | None:
-        """Return what was measured since the last call; None when nothing was."""
+        """Return what was measured since the last call; None if nothing was."""
         recovery = self.recovery
         sent, lost = recovery.total_sent, recovery.total_lost
         if not self.rtts and sent == self.reported_sent:
@@ -337,22 +337,22 @@ class Path:
         return measured
 
     def _take_fates(self) -> tuple[int, int]:
-        """Return how many datagrams arrived and were missed since the last call."""
+        """Return how many datagrams arrived and were missing since the last call."""
         arrived, missed = self.recovery.total_arrived, self.recovery.reordering.missed
         told_arrived, told_missed = self.reported_fates
-        # More may have turned up late than was missed in the meantime: then so many fewer are told next time.
+        # More may have turned up late than went missing in the meantime: then the next report has that many fewer.
         self.reported_fates = arrived, max(missed, told_missed)
         return arrived - told_arrived, max(0, missed - told_missed)
 
     def waits_for_answer(self, now: float) -> None:
-        """Something that wants an answer left."""
+        """Note that something left that wants an answer."""
         if self._waiting_since is None:
             self._waiting_since = self._oldest_at = now
 
     def made_progress(self, now: float) -> bool:
-        """The peer proved that our datagrams arrive; True when that brings the path up.
+        """Note that the peer proved that our datagrams arrive; return True if that brings the path up.
 
-        Not before there are fresh keys: who has but one end's session key could have seemed the other.
+        The path stays down until there are fresh keys: anyone with one end's session key could have posed as the other.
         """
         if not self.keys.are_fresh:
             return False
@@ -371,12 +371,12 @@ class Path:
 
     @property
     def silence_timer(self) -> float | None:
-        """When the present silence makes the path unstable or down.
+        """When the current silence makes the path unstable or down.
 
-        Two things must be overdue: any sign of life, by how the path answered until now, and the answer to the oldest
-        of what left, by how long the last one took. Of a path that is in use the first one says more: whatever queue
-        there is, what stands in it arrives one after the other. Of one that rested nothing is to be expected before a
-        round trip is over, and with a queue of others that may be one of many seconds.
+        Two things must be overdue: any sign of life, by how the path answered so far, and the answer to the oldest
+        datagram, by how long the last answer took. On a path in use the first one says more: whatever the queue, its
+        datagrams arrive one after the other. On a path that rested nothing can come before a round trip is over, and
+        other traffic's queue can make that many seconds.
         """
         if self._waiting_since is None or self.state is PathState.DOWN:
             return None
@@ -388,7 +388,7 @@ class Path:
         return max(self._waiting_since + limit, self._oldest_at + answer)
 
     def check_silence(self, now: float) -> PathState | None:
-        """Return the new state when the silence changed it."""
+        """Return the new state if the silence changed it."""
         timer = self.silence_timer
         if timer is None or timer > now:
             return None
@@ -400,7 +400,7 @@ class Path:
         return self.state
 
     def go_down(self) -> None:
-        """It is as good as dead. What was asked before may still be answered, if the path is slow rather than dead."""
+        """Mark the path down. It may be slow rather than dead, so what was asked before may still be answered."""
         self.state = PathState.DOWN
         self._waiting_since = None
         self.opening.forget_previous()

@@ -1,11 +1,11 @@
-"""How large a datagram one path carries: packetization layer path MTU discovery (RFC 8899; RFC 9000 section 14.3).
+"""Finds how large a datagram one path carries: PLPMTUD (RFC 8899; RFC 9000 section 14.3).
 
 Sizes are bytes of UDP payload. Every path starts at BASE_BYTES, which need not be proven. Probes, padded to the size
-under test and answered by a small PROBE_REPLY, go up common sizes to what the local interface takes; what is confirmed
-holds at once. ICMP is never believed. A lost probe is neither congestion nor a failure of the path.
+under test and answered by a small PROBE_REPLY, step through common sizes up to what the local interface takes. A
+confirmed size holds at once. ICMP is never believed. A lost probe is neither congestion nor a failure of the path.
 
-Two things bring a path back to the base: full-sized datagrams that vanish while small ones pass (a black hole,
-RFC 8899 section 4.3: the route changed), and the path having been down (it may be another route now).
+Two things return a path to the base: full-sized datagrams that vanish while small ones pass (a black hole, RFC 8899
+section 4.3: the route changed), and the path having been down (its route may have changed).
 """
 
 from __future__ import annotations
@@ -15,19 +15,19 @@ from functools import lru_cache
 from sidecar.core.wire.frame import BASE_BYTES, MAX_DATAGRAM_BYTES
 
 COMMON_MTUS = (1280, 1400, 1420, 1492, 1500, 4096, 9000)
-"""MTUs tried, where the interface takes them: IPv6's least, mobile networks, WireGuard, PPPoE, Ethernet, jumbo frames.
-What the interface itself takes is always tried last."""
+"""MTUs tried, where the interface takes them: IPv6's minimum, mobile networks, WireGuard, PPPoE, Ethernet, jumbo
+frames. The interface's own MTU is always tried last."""
 MAX_PROBES = 3
-"""Unanswered probes after which a size does not pass (RFC 8899 section 5.1.2)."""
+"""Unanswered probes after which a size counts as too large (RFC 8899 section 5.1.2)."""
 PROBE_TIMEOUT_S = 1.0
-"""A probe is unanswered after this (RFC 8899 section 5.1.1), or after some round trips of a slower path."""
+"""Time after which a probe is unanswered (RFC 8899 section 5.1.1), or some round trips of a slower path if longer."""
 RAISE_EVERY_S = 600.0
-"""A larger size is looked for again this often (RFC 8899 section 5.1.1)."""
+"""Interval of searches for a larger size (RFC 8899 section 5.1.1)."""
 RETRY_S = 10.0
-"""First new search after a black hole; doubles up to RAISE_EVERY_S with each further one, so that a path which carries
-probes but not data is left alone."""
+"""First new search after a black hole. It doubles up to RAISE_EVERY_S with each further one, so that a path that
+carries probes but no data is left alone."""
 BLACK_HOLE_LOST = 6
-"""Datagrams above the base, lost in a row (at 5 % of random loss once in 60 million), ..."""
+"""Datagrams above the base, lost in a row (once in 60 million at 5 % random loss), ..."""
 BLACK_HOLE_REPORTS = 2
 """... and found lost on as many occasions, since one burst takes many at once."""
 
@@ -35,14 +35,14 @@ HEADERS_V4 = 28
 HEADERS_V6 = 48
 """IP and UDP headers, without options."""
 LEAST_MTU = BASE_BYTES + HEADERS_V4
-"""Of an interface, below which datagrams of BASE_BYTES do not leave."""
+"""Least MTU of an interface, below which datagrams of BASE_BYTES do not leave."""
 PROBES_REMEMBERED = 2 * MAX_PROBES
 """Probes whose late reply still counts."""
 
 
 @lru_cache(maxsize=64)
 def payloads(mtu: int, *, ipv6: bool) -> tuple[int, ...]:
-    """Return what to try on an interface of this MTU (bytes), ascending: above BASE_BYTES, up to MAX_DATAGRAM_BYTES."""
+    """Return the sizes to try at this interface MTU (bytes), ascending: above BASE_BYTES, up to MAX_DATAGRAM_BYTES."""
     headers = HEADERS_V6 if ipv6 else HEADERS_V4
     sizes = {min(candidate, mtu) - headers for candidate in COMMON_MTUS} | {mtu - headers}
     return tuple(sorted({min(size, MAX_DATAGRAM_BYTES) for size in sizes if size > BASE_BYTES}))
@@ -72,7 +72,7 @@ class PathMtu:
         """Largest datagram that may be sent, in bytes."""
         self._told: tuple[int, ...] = ()
         self._sizes: tuple[int, ...] = ()
-        """What is looked for: as told, or less after the kernel refused more."""
+        """Sizes to try: as given to `start`, or fewer after the kernel refused one."""
         self._at: float | None = None
         self._target: int | None = None
         """The size under test; None between two searches."""
@@ -87,9 +87,9 @@ class PathMtu:
     # -- the path's life ------------------------------------------------------------------------------------------
 
     def start(self, sizes: tuple[int, ...], now: float) -> bool:
-        """The path is up, over an interface that takes these `payloads`: search, unless that was known.
+        """Search on a path that is up over an interface that takes these `payloads`, unless they are known.
 
-        True when it makes datagrams smaller.
+        Returns True if datagrams get smaller.
         """
         if self._at is not None and sizes == self._told:
             return False
@@ -101,7 +101,7 @@ class PathMtu:
         return lowered
 
     def stop(self) -> bool:
-        """The path is down, or leads elsewhere: back to the base without probing; True when it was above it."""
+        """Return to the base without probing, as the path is down or leads elsewhere; True if it was above the base."""
         lowered = self._to_base()
         self._at = None
         return lowered
@@ -110,13 +110,13 @@ class PathMtu:
 
     @property
     def timer(self) -> float | None:
-        """When `next_probe` is wanted; None while nothing is looked for."""
+        """When `next_probe` is wanted; None while there is no search."""
         return self._at
 
     def next_probe(self, probe_id: int, now: float, timeout_s: float = PROBE_TIMEOUT_S) -> int | None:
-        """Return the size of the probe that leaves now under this id; None when none is due.
+        """Return the size of the probe that leaves now under this id; None if none is due.
 
-        `timeout_s` is when its reply is overdue, at least PROBE_TIMEOUT_S.
+        `timeout_s` is how long its reply may take, at least PROBE_TIMEOUT_S.
         """
         if self._at is None or now < self._at:
             return None
@@ -135,7 +135,7 @@ class PathMtu:
         return self._target
 
     def on_reply(self, probe_id: int, now: float) -> bool:
-        """A PROBE_REPLY came; False when it answers none of these probes."""
+        """Take a PROBE_REPLY; return False if it answers none of these probes."""
         size = self._out.pop(probe_id, None)
         if size is None:
             return False
@@ -143,7 +143,7 @@ class PathMtu:
             self.size = size
             self._forgive()
             if self._target is None or self._target <= size:
-                # Also when it comes so late that the search was given up.
+                # Also if it comes so late that the search was given up.
                 self._target = None
                 self._at = now
         return True
@@ -156,7 +156,7 @@ class PathMtu:
         self._at = max(now, self._probed_at + PROBE_TIMEOUT_S)
 
     def _above(self) -> int | None:
-        """The next size worth testing."""
+        """Return the next size worth testing."""
         return next((size for size in self._sizes if size > self.size), None)
 
     def _rest(self, now: float) -> None:
@@ -166,14 +166,14 @@ class PathMtu:
     # -- what becomes of the data ---------------------------------------------------------------------------------
 
     def on_delivered(self, size: int) -> None:
-        """A datagram of this many bytes was acknowledged or answered."""
+        """Note that a datagram of this many bytes was acknowledged or answered."""
         if size > BASE_BYTES:
             self._forgive()
         elif self._row:
             self._small_passed = True
 
     def on_lost(self, count: int, now: float) -> bool:
-        """`count` datagrams above BASE_BYTES were found lost at once; True when datagrams get smaller by it."""
+        """Note `count` datagrams above BASE_BYTES found lost at once; return True if datagrams get smaller."""
         if self.size == BASE_BYTES:
             return False
         self._row += count
@@ -187,7 +187,7 @@ class PathMtu:
         return True
 
     def on_too_big(self, size: int, now: float) -> bool:
-        """The kernel refused to send this many bytes over the interface; True when datagrams get smaller by it."""
+        """Note that the interface's kernel refused to send this many bytes; return True if datagrams get smaller."""
         if size <= BASE_BYTES or self._at is None:
             return False
         lowered = self.size >= size

@@ -1,8 +1,8 @@
-"""When one path is probed, and which of its probes may still be answered.
+"""Schedules the probes of one path, and knows which of them may still be answered.
 
-A path in use is probed twice a second. One that rests is probed ever less often, so that a thousand robots that ask for
-nothing cost a server next to nothing, but never so rarely that a NAT forgets it. One end leads: the robot, whose NAT it
-is. The other end asks in the datagram with which it answers, and by itself only when it was not asked for long.
+A path in use is probed twice a second. A resting one is probed ever less often, so that a thousand idle robots cost a
+server next to nothing, but often enough that no NAT forgets it. One end leads: the robot, as the NAT is its own. The
+other end asks in the datagram with which it answers, and by itself only if it was not asked for long.
 """
 
 from __future__ import annotations
@@ -19,74 +19,74 @@ if TYPE_CHECKING:
     from sidecar.core.base.values import PathId
 
 IDLE_PROBE_S = 0.5
-"""A path that was in use a moment ago is probed this often, which finds a dead one within a second, ..."""
+"""Interval of probes on a recently used path; it finds a dead one within a second, ..."""
 IDLE_SHARE = 8.0
-"""... one that rests as often as this fits into the time that it has rested, ..."""
+"""... on a resting path the interval is the time that it has rested divided by this, ..."""
 MAX_IDLE_PROBE_S = 15.0
-"""... and no path less often. RFC 4787 asks NATs to remember for 2 minutes; those of mobile networks forget after 30 s
-at times, which leaves room for a probe that gets lost."""
+"""... but at most this. RFC 4787 asks NATs to remember for 2 minutes; some mobile networks forget after 30 s, which
+leaves room for a lost probe."""
 IDLE_SPREAD = 0.2
-"""Share of that by which it comes sooner or later: the paths of many robots that began together drift apart."""
+"""Share by which that interval varies either way, so that the paths of many robots that began together drift apart."""
 WATCH_FACTOR = 2.5
-"""The end that does not lead asks by itself when it was not asked for so many times as long as usual."""
+"""The end that does not lead asks by itself after this many times the usual interval without being asked."""
 FIRST_PROBE_S = 0.05
-"""Probes to a path that is not up start this close together ..."""
+"""Initial interval of probes on a path that is not up ..."""
 MAX_PROBE_S = 1.0
-"""... and back off to this, so that a path that comes back is seen within a second, ..."""
+"""... which backs off to this, so that a path that comes back is seen within a second, ..."""
 MAX_WATCH_PROBE_S = 15.0
-"""... or to this at the end that does not lead: a thousand robots that are out of reach must not keep it busy."""
+"""... or to this at the end that does not lead: a thousand unreachable robots must not keep it busy."""
 FREE_ADDRESSES = 16
 """A peer that announces more addresses has all of them probed that much less often until they answer: it gets no more
 datagrams out of us, wherever they lead."""
 PROBE_BACKOFF = 1.5
 RETURN_BACKOFF = 1.02
-"""A path that was up is likely to come back, and requests may wait for it: its probes are as far apart as a fiftieth of
-the time that it is down, 0.25 s after ten seconds. Both ends probe, so that the wait is mostly half of that or less."""
+"""A path that was up is likely to come back, and requests may wait for it: its probes are a fiftieth of its downtime
+apart, 0.25 s after ten seconds. Both ends probe, so the wait is mostly half of that or less."""
 DOWN_SPREAD = 0.1
 """As IDLE_SPREAD, for a path that is not up."""
 MAX_PROBES_OUT = 1024
-"""Unanswered probes of either kind that are remembered: those of LONGEST_ANSWER_S, no two within FIRST_PROBE_S, to some
+"""Unanswered probes of either kind that are remembered: those of LONGEST_ANSWER_S, spaced by FIRST_PROBE_S, to a few
 addresses each."""
 
 
 class Probe(NamedTuple):
-    """One that was answered."""
+    """A probe that was answered."""
 
     sent_at: float
     to: Address | None
-    """Where it went, and nowhere else: so the peer is there."""
+    """The only address that it went to: so the peer is there."""
     sealed: bool
-    """With this path's keys, so that the answer confirms those."""
+    """Whether this path's keys sealed it, so that the answer confirms them."""
 
 
 @dataclass(slots=True)
 class SentPing:
-    """One that waits to leave, or for its answer."""
+    """A ping that waits to leave, or for its answer."""
 
     id: int
-    """Of its PROBE."""
+    """Id of its PROBE."""
     number: int
     path: PathId
     size: int
-    """Of its datagram: bytes of UDP payload."""
+    """Bytes of its datagram's UDP payload."""
     sent_at: float | None = None
 
 
 class Probing:
-    """The plan of one path's probes, and the memory of them. Times in seconds."""
+    """The schedule of one path's probes, and the memory of them. Times in seconds."""
 
     __slots__ = ("_asked_at", "_asked_every", "_back", "_gap", "_leads", "_out", "_proven_at", "_rng", "_used_at",
                  "_was_up", "at", "crowd", "last_at")  # fmt: skip
 
     def __init__(self, now: float, rng: random.Random, *, leads: bool) -> None:
-        """`rng` must be one that nobody can foresee: who guesses an id could answer what he did not get."""
+        """Create the schedule; `rng` must be unpredictable: who guesses an id could answer a probe he did not get."""
         self._rng = rng
         self.at = now
-        """When the next one leaves."""
+        """When the next probe leaves."""
         self.last_at = now - FIRST_PROBE_S
-        """When the last one left."""
+        """When the last probe left."""
         self.crowd = 0
-        """How many addresses the peer announced, over all its interfaces."""
+        """Number of addresses that the peer announced, over all its interfaces."""
         self._leads = leads
         self._gap = FIRST_PROBE_S
         self._was_up = False
@@ -94,11 +94,12 @@ class Probing:
         self._proven_at = now
         self._asked_at = now
         self._asked_every = MAX_IDLE_PROBE_S
-        """How often the peer asks."""
+        """Interval at which the peer asks."""
         self._out: dict[int, Probe] = {}
-        """What was asked by plan, the oldest first."""
+        """Scheduled probes, the oldest first."""
         self._back: dict[int, Probe] = {}
-        """What was asked of introductions. Apart, since whoever repeats those makes us ask as often."""
+        """Probes sent in answer to introductions. They are kept apart, since each repeated introduction makes us send
+        one."""
 
     # -- looking at it -----------------------------------------------------------------------------------------------
 
@@ -113,22 +114,22 @@ class Probing:
         return self._used_at
 
     def pause(self, now: float) -> float:
-        """Return how far apart probes are while the path is up, about (s)."""
+        """Return the approximate interval of probes while the path is up (s)."""
         return self._pause(now)
 
     # -- asking and being answered --------------------------------------------------------------------------------
 
     def take_id(self) -> int:
-        """Return the id of the next probe, of liveness or of size."""
+        """Return the id of the next probe, of liveness or of MTU."""
         return self._rng.getrandbits(64)
 
     def ask(self, now: float, to: Address | None, *, sealed: bool) -> int:
-        """Return the id of a probe that leaves now to this address, by plan."""
+        """Return the id of a scheduled probe that leaves now to this address."""
         self.last_at = now
         return self._note(self._out, Probe(now, to, sealed))
 
     def ask_back(self, now: float, to: Address) -> int:
-        """Return the id of a sealed probe that leaves now with the answer to an introduction, to where that was."""
+        """Return the id of a sealed probe that leaves now with the answer to an introduction, to its source."""
         return self._note(self._back, Probe(now, to, sealed=True))
 
     def _note(self, out: dict[int, Probe], probe: Probe) -> int:
@@ -142,34 +143,34 @@ class Probing:
         return probe_id
 
     def answered(self, probe_id: int, now: float) -> Probe | None:
-        """Return the probe that this answers, once and not too late; None when it answers nothing we asked."""
+        """Return the probe that this answers, once and not too late; None if it answers nothing we asked."""
         probe = self._out.pop(probe_id, None) or self._back.pop(probe_id, None)
         return probe if probe is not None and probe.sent_at > now - LONGEST_ANSWER_S else None
 
     def forget(self) -> None:
-        """Answers to what was asked until now prove nothing."""
+        """Forget the probes so far: their answers prove nothing."""
         self._out.clear()
         self._back.clear()
 
     # -- planning -------------------------------------------------------------------------------------------------
 
     def plan_up(self, now: float) -> None:
-        """The path is up, and a probe left: plan the next one."""
+        """Plan the next probe of a path that is up, after one left."""
         self.at = now + self._pause(now) * self._rng.uniform(1 - IDLE_SPREAD, 1 + IDLE_SPREAD)
 
     def plan_unstable(self, now: float, smoothed_rtt_s: float) -> None:
-        """As `plan_up`, for a path that is silent, or leads to where the peer has not proven to be."""
+        """Do as `plan_up` for a path that is silent, or leads to an address that the peer has not proven."""
         self.at = now + max(FIRST_PROBE_S, smoothed_rtt_s) * self._rng.uniform(1 - DOWN_SPREAD, 1 + DOWN_SPREAD)
 
     def plan_down(self, now: float) -> None:
-        """As `plan_up`, for a path that is down."""
+        """Do as `plan_up` for a path that is down."""
         self.at = now + self._gap * self._rng.uniform(1 - DOWN_SPREAD, 1 + DOWN_SPREAD)
         backoff = RETURN_BACKOFF if self._was_up else PROBE_BACKOFF
         self._gap = min(self._gap * backoff, self._patience * (MAX_PROBE_S if self._leads else MAX_WATCH_PROBE_S))
 
     @property
     def _patience(self) -> float:
-        """How many times longer than usual a path that is not up waits between two probes."""
+        """Factor by which a path that is not up waits longer than usual between two probes."""
         return max(1.0, self.crowd / FREE_ADDRESSES)
 
     def _pause(self, now: float) -> float:
@@ -179,32 +180,32 @@ class Probing:
         return WATCH_FACTOR * min(pause, max(IDLE_PROBE_S, self._asked_every))
 
     def came_up(self, now: float) -> None:
-        """The path is up."""
+        """Note that the path came up."""
         self._was_up = True
         self._gap = FIRST_PROBE_S
         self._proven_at = self._used_at = now
         self.at = now + self._pause(now)
 
     def proven(self, now: float) -> None:
-        """The path, up before, proved that it lives."""
+        """Note that the path, already up, proved that it lives."""
         self._proven_at = now
         pause = self._pause(now)
         if not now + pause / 2 <= self.at <= now + pause * (1 + IDLE_SPREAD):
             self.at = now + pause
 
     def used(self, now: float) -> None:
-        """Something other than probes travels: a path in use is not at rest."""
+        """Note that something other than probes travels: the path is in use."""
         self._used_at = now
         self.at = min(self.at, now + self._pause(now))
 
     def needed(self, now: float) -> None:
-        """The path, up, may be used any moment: what is known of it must not be old."""
+        """Note that the path, which is up, may be used any moment: what is known of it must be recent."""
         self.used(now)
         if now - self._proven_at > IDLE_PROBE_S:
             self.at = min(self.at, max(now, self.last_at + IDLE_PROBE_S))
 
     def asked(self, now: float) -> None:
-        """The peer probed the path, which is up: who does not lead asks in the same datagram, unless it just did."""
+        """Note that the peer probed the path, which is up: the end that does not lead asks back unless it just did."""
         if self._leads:
             return
         self._asked_every, self._asked_at = now - self._asked_at, now
@@ -214,14 +215,14 @@ class Probing:
             self.at = now + self._pause(now)
 
     def hasten(self, now: float, smoothed_rtt_s: float) -> None:
-        """It is time to ask again: but what was asked a round trip ago may still be answered, whoever wishes it."""
+        """Ask again soon, but not within a round trip of the last probe: that one may still be answered."""
         self.at = min(self.at, max(now, self.last_at + max(self._patience * FIRST_PROBE_S, smoothed_rtt_s)))
 
     def challenge(self, now: float) -> None:
-        """Ask at once, unless that was done a moment ago: the peer shows up where it has not proven to be."""
+        """Ask at once, unless that was just done: the peer shows up at an address that it has not proven."""
         self.at = min(self.at, max(now, self.last_at + FIRST_PROBE_S))
 
     def begin_again(self, now: float) -> None:
-        """The path may have come back: probe at once, and the first ones close together."""
+        """Probe at once, the first ones close together: the path may have come back."""
         self._gap = FIRST_PROBE_S
         self.at = now

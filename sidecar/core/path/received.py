@@ -1,28 +1,28 @@
-"""Packet numbers received on one path, and the acknowledgement owed for them."""
+"""Tracks the packet numbers received on one path, and the acknowledgement owed for them."""
 
 from __future__ import annotations
 
 from sidecar.core.wire.frame import MAX_ACK_RANGES
 
 MAX_ACK_DELAY_S = 0.005
-"""A lone datagram's acknowledgement may wait this long for something to travel with."""
+"""Longest time that a lone datagram's acknowledgement waits for something to travel with."""
 ACK_EVERY = 4
-"""Acknowledge at once after this many ack-eliciting datagrams. RFC 9000 (section 13.2.2) says two, and may be departed
-from: each acknowledgement costs both ends about as much processor time as a datagram. With eight, the rate of bursts
+"""Ack-eliciting datagrams that trigger an acknowledgement at once. RFC 9000 (section 13.2.2) says two, but allows
+others: each acknowledgement costs both ends about as much processor time as a datagram. With eight, the rate of bursts
 is seen too late, and 17 ms of queue instead of 12 stand in a 20 Mbit/s link."""
 STALE_PACKETS = 1024
-"""Ranges this far below the largest are no longer told: the sender has long declared their gaps lost."""
+"""Ranges this far below the largest are no longer reported: the sender has long declared their gaps lost."""
 
 
 class ReceivedPackets:
-    """Which packet numbers came, as at most MAX_ACK_RANGES inclusive ranges, highest first."""
+    """The packet numbers that came, as at most MAX_ACK_RANGES inclusive ranges, highest first."""
 
     __slots__ = ("_ack_at", "_floor", "_gap", "_largest_at", "_ranges", "_unacked")
 
     def __init__(self) -> None:
         self._ranges: list[list[int]] = []
         self._floor = -1
-        """Everything up to here counts as received before: it may have been, and its range is forgotten."""
+        """Everything up to here counts as received: it may have been, but its range is forgotten."""
         self._largest_at = 0.0
         self._ack_at: float | None = None
         self._unacked = 0
@@ -46,7 +46,7 @@ class ReceivedPackets:
         self._largest_at = now
 
     def add(self, number: int, now: float) -> bool:
-        """Note a packet number; False when it came before or is older than what is remembered."""
+        """Note a packet number; return False if it came before or is older than what is remembered."""
         if number > self.largest:
             self.add_run(number, number, now)
             return True
@@ -84,7 +84,7 @@ class ReceivedPackets:
         return True
 
     def owe_ack(self, now: float, count: int = 1) -> None:
-        """Ack-eliciting datagrams came: acknowledge soon, or now when they show a gap or one is the second."""
+        """Owe an acknowledgement of ack-eliciting datagrams: now after a gap or ACK_EVERY of them, else soon."""
         self._unacked += count
         if self._unacked >= ACK_EVERY or self._gap:
             self._ack_at = now
@@ -97,7 +97,7 @@ class ReceivedPackets:
         return self._ack_at
 
     def take_ack(self, now: float) -> tuple[list[tuple[int, int]], float]:
-        """Return the ranges and the delay since the largest came, and owe nothing any more."""
+        """Return the ranges and the delay since the largest came, and clear what is owed."""
         self._ack_at = None
         self._unacked = 0
         self._gap = False

@@ -1,4 +1,4 @@
-"""Datagrams in flight on one path: acknowledgement, loss detection, probe timeout (terms of RFC 9002)."""
+"""Tracks the datagrams in flight on one path: acknowledgement, loss detection, probe timeout (terms of RFC 9002)."""
 
 from __future__ import annotations
 
@@ -21,14 +21,16 @@ if TYPE_CHECKING:
     from sidecar.core.wire.frame import AckFrame
 
 PTO_DATAGRAMS = 2
-"""How many of the oldest datagrams a probe timeout gives up (RFC 9002 section 6.2.4 allows two probes)."""
+"""Number of the oldest datagrams that a probe timeout gives up (RFC 9002 section 6.2.4 allows two probes)."""
 FIRST_SKIP, MAX_SKIP = 128, 1 << 17
-"""Among the first so many datagrams a packet number is left out, then among twice as many, up to this many: who
-acknowledges what never came, to be sent more than its path carries, names one of these (RFC 9000 section 21.4)."""
+"""Among the first FIRST_SKIP datagrams a packet number is skipped, then among twice as many, up to MAX_SKIP. A peer
+that acknowledges what never came, to be sent more than its path carries, names a skipped one (RFC 9000 section 21.4).
+"""
 MAX_SKIPPED = 16
-"""Numbers left out that are remembered, the newest."""
+"""Skipped numbers that are remembered, the newest."""
 MAX_PTO_BACKOFF = 6
-"""Probe timeouts stop doubling here, or when they are as long as anybody waits on this path, or as an answer takes."""
+"""Doublings after which probe timeouts stop growing. They also stop at the longest wait on this path, or at the time an
+answer takes."""
 
 _first = attrgetter("first")
 
@@ -57,36 +59,36 @@ class Recovery:
     )
 
     def __init__(self, first_number: int, rng: random.Random | None = None) -> None:
-        """Without `rng` no packet number is left out."""
+        """Create the state; without `rng` no packet number is skipped."""
         self.rtt = RttEstimator()
         self.reordering = Reordering()
         self.sent: list[Sent] = []
-        """In the order of their packet numbers."""
+        """In the order of packet numbers."""
         self.sample: RateSample | None = None
-        """What the last acknowledgement says of the path's rate; None when it acknowledged no fragment."""
+        """The last acknowledgement's sample of the path's rate; None if it acknowledged no fragment."""
         self.in_flight = 0
         self.largest_acked = first_number - 1
         self.last_eliciting_at = 0.0
         self.total_sent = 0
         self.total_lost = 0
         self.total_arrived = 0
-        """Acknowledged datagrams, of those that are (ack-eliciting ones)."""
+        """Acknowledged datagrams, among those that elicit an ack."""
         self._next_number = first_number
         self._rng = rng
         self._skip_every = FIRST_SKIP
         self._skipped: deque[int] = deque(maxlen=MAX_SKIPPED)
-        """Packet numbers that were left out, lately."""
+        """Recently skipped packet numbers."""
         self._skip_at = self._next_skip() if rng is not None else math.inf
         self._lost_at: float | None = None
         self._pto_count = 0
 
     @property
     def next_number(self) -> int:
-        """The packet number that comes next."""
+        """The next packet number."""
         return self._next_number
 
     def take_numbers(self, count: int = 1) -> int:
-        """Return the first of the packet numbers of the next `count` datagrams."""
+        """Take the packet numbers of the next `count` datagrams and return the first."""
         if self._next_number + count > self._skip_at:
             self._skipped.append(self._next_number)
             self._next_number += 1
@@ -112,14 +114,14 @@ class Recovery:
         index: int,
         finished: tuple[int, ...] = (),
     ) -> None:
-        """Datagrams left that carry the symbols of `message` from `index` on, one each; sizes as in `Sent`.
+        """Note datagrams that carry the symbols of `message` from `index` on, one each; sizes as in `Sent`.
 
-        A single one may report messages FINISHED besides.
+        A single datagram may also report messages FINISHED.
         """
         self._note(Sent(first, count, now, segment, last, message, index, finished))
 
     def on_finished_sent(self, number: int, now: float, size: int, finished: tuple[int, ...]) -> None:
-        """A datagram left that reports these messages FINISHED."""
+        """Note a datagram that reports these messages FINISHED."""
         self._note(Sent(number, 1, now, size, size, finished=finished))
 
     def _note(self, sent: Sent) -> None:
@@ -128,9 +130,9 @@ class Recovery:
         self.last_eliciting_at = sent.at
 
     def on_ack(self, ack: AckFrame, now: float) -> list[Sent] | None:
-        """Take an acknowledgement and return what it newly acknowledges; None when it acknowledges the unsent.
+        """Take an acknowledgement and return what it newly acknowledges; None if it acknowledges what was never sent.
 
-        An honest peer never does.
+        An honest peer never does that.
         """
         largest = ack.ranges[0][1]
         if largest >= self._next_number:
@@ -139,7 +141,7 @@ class Recovery:
             return None
         newly: list[Sent] = []
         for low, high in ack.ranges:
-            # From the oldest in flight on: what a peer repeats or makes up below it costs nothing.
+            # Start at the oldest in flight: what a peer repeats or makes up below it costs nothing.
             if not self.sent or high < self.sent[0].first:
                 break
             self._acknowledge(low, high, newly)
@@ -152,7 +154,7 @@ class Recovery:
         return newly
 
     def _acknowledge(self, low: int, high: int, newly: list[Sent]) -> None:
-        """Move what the inclusive range covers from `sent` to `newly`; the rest of the runs it cuts stays."""
+        """Move what the inclusive range covers from `sent` to `newly`; keep the rest of the runs it cuts."""
         runs = self.sent
         start = bisect_right(runs, low, key=_first)
         if start and runs[start - 1].end > low:
@@ -182,10 +184,10 @@ class Recovery:
             self.rtt.sample(now - newest_at, now, peer_delay_s)
 
     def late(self, ack: AckFrame, now: float) -> list[Sent]:
-        """Return what an acknowledgement says to have arrived although it was declared lost."""
+        """Return what an acknowledgement covers although it was declared lost."""
         arrived = self.reordering.late(ack.ranges, self.rtt, now)
         if arrived:
-            # Where every answer takes longer than the timeouts, these are all that tell how long.
+            # Where every answer takes longer than the timeouts, only these tell how long.
             self._pto_count = 0
             newest_at = next((run.at for run in arrived if run.end == ack.ranges[0][1] + 1), None)
             if newest_at is not None:
@@ -194,7 +196,7 @@ class Recovery:
         return arrived
 
     def detect_lost(self, now: float) -> list[Sent]:
-        """Return what packet and time threshold call lost by now, and arm the time threshold for the rest."""
+        """Return what the packet and time thresholds declare lost by now, and arm the time threshold for the rest."""
         self._lost_at = None
         delay = self.reordering.loss_delay(self.rtt)
         threshold = self.reordering.packet_threshold
@@ -216,7 +218,7 @@ class Recovery:
         return self._lose(lost, by_threshold=True)
 
     def on_probe_timeout(self, now: float) -> list[Sent]:
-        """The probe timeout passed: give up the oldest datagrams so that their content travels again."""
+        """Give up the oldest datagrams after a probe timeout, so that their content travels again."""
         self._pto_count = min(self._pto_count + 1, MAX_PTO_BACKOFF)
         self.last_eliciting_at = now
         lost: list[Sent] = []
@@ -230,14 +232,14 @@ class Recovery:
         return self._lose(lost, by_threshold=False)
 
     def ask_at_once(self, now: float) -> None:
-        """The path answers again, but not about what is in flight: the probe timeout is now, however long it was."""
+        """Make the probe timeout due now: the path answers again, but not about what is in flight."""
         self._pto_count = 0
         self.last_eliciting_at = now - self._longest_timeout()
 
     def give_up_all(self, *, forget: bool) -> list[Sent]:
-        """The path is dead: everything in flight counts as lost.
+        """Declare everything in flight lost because the path is dead.
 
-        With `forget`, what is acknowledged of it later proves nothing.
+        With `forget`, a later acknowledgement of it proves nothing.
         """
         lost, self.sent = self.sent, []
         self._lost_at = None
@@ -260,7 +262,7 @@ class Recovery:
 
     @property
     def loss_timer(self) -> float | None:
-        """When `detect_lost` has something to find without a further acknowledgement."""
+        """When `detect_lost` finds something without a further acknowledgement."""
         return self._lost_at
 
     @property

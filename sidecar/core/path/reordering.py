@@ -1,11 +1,11 @@
-"""What was declared lost and is acknowledged all the same: it tells that the path lives, and how much it reorders.
+"""Learns from late acknowledgements of lost datagrams: they prove that the path lives, and how much it reorders.
 
-Radio links retransmit below us, so that some datagrams are overtaken by many. As long as that is not seen, three later
-acknowledgements prove a loss (RFC 9002 section 6.1.1). Once it is, only time does, and the time threshold grows by how
-much too early it was, to one round trip more at most (after RACK, RFC 8985 section 6.2, steps 2 and 4).
+Radio links retransmit below us, so that many datagrams overtake some. Until that is seen, three later acknowledgements
+prove a loss (RFC 9002 section 6.1.1). After that only time does. The time threshold grows by how much it was too early,
+to at most one more round trip (after RACK, RFC 8985 section 6.2, steps 2 and 4).
 
 Where round trips grow by seconds at once, everything is declared lost before its acknowledgement comes. Packet numbers
-are never used twice, so each such acknowledgement tells how long the path takes now.
+are never reused, so each such acknowledgement tells how long the path takes now.
 """
 
 from __future__ import annotations
@@ -27,20 +27,20 @@ if TYPE_CHECKING:
 PACKET_THRESHOLD = 3
 """A datagram is lost when one sent this many later is acknowledged (RFC 9002 section 6.1.1)."""
 PERSISTS = 16
-"""What is known of reordering is forgotten after so many losses that stayed losses (RACK's reo_wnd_persist)."""
+"""Losses that stayed losses after which learned reordering is forgotten (RACK's reo_wnd_persist)."""
 MAX_REMEMBERED = 64
 """Lost runs whose late acknowledgement is still noticed; beyond that the oldest are forgotten."""
 MEMORY_FACTOR = 4.0
-"""What is acknowledged after this many probe timeouts was not overtaken: the path was slow, or away."""
+"""A datagram acknowledged after this many probe timeouts was not overtaken: the path was slow, or away."""
 
 
 class _Why(Enum):
     THRESHOLD = auto()
-    """Others arrived that left later: it is missing."""
+    """Later datagrams arrived: it is missing."""
     TIMEOUT = auto()
-    """Nothing arrived: whether it is missing is not known yet."""
+    """Nothing arrived: it may or may not be missing."""
     OVERTAKEN = auto()
-    """Nothing arrived at first, then something that left later."""
+    """Nothing arrived at first, then a later datagram."""
     OUTAGE = auto()
     """The path went down."""
 
@@ -54,7 +54,7 @@ class _Lost(NamedTuple):
 
 
 class Reordering:
-    """Lost datagrams of one path that may still turn up, and what follows for the thresholds."""
+    """Lost datagrams of one path that may still turn up, and their effect on the thresholds."""
 
     __slots__ = ("_extra_s", "_lost", "_persists", "missed", "spurious")
 
@@ -65,7 +65,7 @@ class Reordering:
         self.spurious = 0
         """Datagrams declared lost that had arrived."""
         self.missed = 0
-        """Datagrams known to be missing while others arrived; it falls by those that turn up."""
+        """Datagrams known to be missing while others arrived, less those that turned up."""
 
     @property
     def remembers(self) -> bool:
@@ -74,15 +74,15 @@ class Reordering:
 
     @property
     def packet_threshold(self) -> int | None:
-        """Datagrams; None where order means nothing."""
+        """In datagrams; None where order means nothing."""
         return None if self._persists else PACKET_THRESHOLD
 
     def loss_delay(self, rtt: RttEstimator) -> float:
-        """Seconds after which a datagram older than an acknowledged one is lost (RFC 9002 section 6.1.2)."""
+        """Return the seconds after which a datagram older than an acknowledged one is lost (RFC 9002 section 6.1.2)."""
         return rtt.loss_delay() + min(self._extra_s, rtt.smoothed)
 
     def note_lost(self, lost: Sequence[Sent], *, by_threshold: bool) -> None:
-        """These were declared lost."""
+        """Note datagrams that were declared lost."""
         why = _Why.THRESHOLD if by_threshold else _Why.TIMEOUT
         self._remember(lost, why)
         if by_threshold:
@@ -93,15 +93,15 @@ class Reordering:
                 self._extra_s = 0.0
 
     def note_given_up(self, lost: Sequence[Sent]) -> None:
-        """The path went down with these in flight."""
+        """Note datagrams in flight when the path went down."""
         self._remember(lost, _Why.OUTAGE)
 
     def _remember(self, lost: Iterable[Sent], why: _Why) -> None:
-        # What it reported FINISHED travels again by then, and there may be many.
+        # What it reported FINISHED is sent again by then, and there may be many.
         self._lost.extend(_Lost(run._replace(finished=()) if run.finished else run, why) for run in lost)
 
     def late(self, ranges: Sequence[tuple[int, int]], rtt: RttEstimator, now: float) -> list[Sent]:
-        """Take an acknowledgement's ranges (inclusive); returns what of the lost it acknowledges."""
+        """Take an acknowledgement's ranges (inclusive); return the lost runs it acknowledges."""
         if not self._lost:
             return []
         rising = ranges[::-1]
@@ -130,7 +130,7 @@ class Reordering:
         return arrived
 
     def overtaken(self, largest_acked: int) -> None:
-        """This packet number arrived: of what was given up without any news, all that left before is missing."""
+        """Note that this packet number arrived: whatever timed out without news and left before it is missing."""
         lost = self._lost
         for position, (run, why) in enumerate(lost):
             if why is _Why.TIMEOUT and run.end <= largest_acked:
@@ -138,7 +138,7 @@ class Reordering:
                 self.missed += run.datagrams
 
     def forget_old(self, now: float) -> None:
-        """Let go of what can not turn up any more, and of messages that are over: memory holds neither."""
+        """Release what cannot turn up any more, and messages that are over, from memory."""
         lost = self._lost
         for _ in list(takewhile(lambda item: item.run.at < now - LONGEST_ANSWER_S, lost)):
             lost.popleft()
@@ -147,12 +147,12 @@ class Reordering:
                 lost[position] = _Lost(run._replace(message=None), why)
 
     def forget(self) -> None:
-        """What is acknowledged from now on of what was lost until now proves nothing."""
+        """Forget the lost: a later acknowledgement of them proves nothing."""
         self._lost.clear()
 
 
 def _covered(run: Sent, ranges: Sequence[tuple[int, int]], highs: Sequence[int]) -> list[Sent]:
-    """The parts of a run that inclusive ranges cover; `highs` are their ends. All lowest first."""
+    """Return the parts of a run that inclusive ranges cover; `highs` are their ends. All lowest first."""
     parts = []
     position = bisect_left(highs, run.first)
     while position < len(ranges):
@@ -165,7 +165,7 @@ def _covered(run: Sent, ranges: Sequence[tuple[int, int]], highs: Sequence[int])
 
 
 def _gaps(run: Sent, parts: Sequence[Sent]) -> list[Sent]:
-    """What of a run is left without these parts of it, lowest first."""
+    """Return what remains of a run without these parts of it, lowest first."""
     left = []
     first = run.first
     for part in parts:

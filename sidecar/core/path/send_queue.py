@@ -3,7 +3,7 @@
 Urgent before bulk: a message's priority comes first. Fresh before late: within a priority, messages that can still make
 their deadline go first, earliest deadline first, and all others after them. So a backlog makes some messages miss
 instead of making each message delay the next one. Among late messages, begun ones go first, then the oldest that can
-still be of use: newer ones would overtake them until they expire. A message that arrives with its deadline over follows
+still be of use: newer ones would overtake them until they expire. A message that arrives past its deadline follows
 after those: after an outage the pace is low at first, and a request made then may seem hopeless but must not wait for
 the backlog. A message that cannot even be answered before it expires goes last, as the pace may rise; when it does, the
 message may be fresh again. No priority starves: while a lower one waits, it gets one symbol in SHARE.
@@ -31,14 +31,14 @@ if TYPE_CHECKING:
     from sidecar.core.message.outbound import OutboundMessage
 
 HASTE = 1.25
-"""A message that has not begun to leave is late when this many times its sending time does not fit any more: what is
-begun should also be finished."""
+"""A message that has not begun to leave is late when this many times its sending time no longer fits: a message that
+begins should also finish."""
 PATIENCE = 0.5
-"""An answer that another path expects is overdue when this part of the time from then to the deadline is over: there
-should be time left for this one."""
+"""An answer that another path expects is overdue after this share of the time between the expected answer and the
+deadline: there should be time left for this path."""
 
 SMALL = 0.1
-"""What takes less than this part of the time that is left is sent at once anyway: others hardly wait for it."""
+"""A message that takes less than this share of the remaining time is sent at once anyway: others hardly wait for it."""
 
 
 class Turn:
@@ -52,10 +52,10 @@ class Turn:
         self.again: deque[int] = deque()
         """Symbols to be sent once more."""
         self.begun = False
-        """Some of what is to be sent has left."""
+        """Whether some of its symbols have left."""
 
     def take(self, most: int) -> tuple[int, int] | None:
-        """Remove and return the next consecutive symbols as (first, count), `most` of them; None when none is left."""
+        """Remove and return the next consecutive symbols as (first, count), at most `most`; None if none is left."""
         needs = self.message.needs
         again = self.again
         while again:
@@ -78,27 +78,27 @@ class Turn:
         return (first, end - first) if end > first else None
 
     def remaining(self) -> tuple[int, ...]:
-        """The symbols that have not left and still have to."""
+        """Return the symbols that have not left and still have to."""
         return tuple(filter(self.message.needs, (*self.again, *range(self.next, self.message.symbols))))
 
     def can_end_by(self, end: float, now: float, pace: float, round_trip_s: float) -> bool:
-        """Whether its last symbol can be answered before `end` at this pace (bytes a second; 0: unknown)."""
+        """Return whether its last symbol can be answered before `end` at this pace (bytes a second; 0: unknown)."""
         if not pace:
             return now < end
         sending_s = self._sending_s(pace) * (1.0 if self.begun else HASTE)
         return now + sending_s + round_trip_s < end
 
     def goes_on(self, now: float, pace: float, round_trip_s: float) -> None:
-        """Some of it has been taken to be sent: tell its siblings when to expect the answer."""
+        """Tell its siblings when to expect the answer: some of it has been taken to be sent."""
         self.begun = True
         self.message.expected_at = now + self._sending_s(pace) + round_trip_s if pace else NEVER
 
     def waits(self) -> None:
-        """Something else goes first: nothing is to be expected of it here."""
+        """Withdraw the expected answer: something else goes first."""
         self.message.expected_at = NEVER
 
     def covered_until(self, now: float, pace: float, round_trip_s: float) -> float | None:
-        """Until when to leave the request to another path that expects the answer in time, and sooner than this one."""
+        """Return until when to leave it to a path that expects the answer in time and sooner; None: not at all."""
         message = self.message
         if len(message.siblings) < 2 or not pace:
             return None
@@ -120,17 +120,17 @@ class Turn:
 
 
 PURGE_AT = 64
-"""Entries before the first look for messages that are over; then whenever their number has doubled."""
+"""Entries that trigger the first search for messages that are over; the next one comes at twice their number."""
 BEGUN = float("-inf")
-"""Sorts what is begun before the other late ones."""
+"""Sort key of begun messages, before the other late ones."""
 MAX_RUN = 64
-"""Symbols in a run: the segments of one offload."""
+"""Symbols in a run, as many as one offload has segments."""
 MAX_RUN_BYTES = 65_000
 """Bytes in a run: the largest UDP payload, less a margin for other frames."""
 
 
 class Run(NamedTuple):
-    """Consecutive symbols of one message, to be sent one after the other."""
+    """Consecutive symbols of one message, to be sent in sequence."""
 
     message: OutboundMessage
     first: int
@@ -138,27 +138,27 @@ class Run(NamedTuple):
 
 
 _Entry: TypeAlias = "tuple[float, int, Turn]"
-"""What it is sorted by, the order of arrival, and the message."""
+"""Sort key, order of arrival, and message."""
 
 
 class _Class:
-    """Messages of one priority by what is to be expected of them: each heap goes after those named before it."""
+    """Messages of one priority by their prospects. Each heap goes after those named before it."""
 
     __slots__ = ("covered", "fresh", "hopeless", "newest", "passed_over", "stale", "useless")
 
     def __init__(self) -> None:
         self.fresh: list[_Entry] = []
-        """Can make their deadline; by that, as the next two."""
+        """Can make their deadline; sorted by it, as the next two."""
         self.hopeless: list[_Entry] = []
-        """Could not make it any more when it was still to come."""
+        """Cannot make their deadline, which was still to come when that showed."""
         self.newest: list[_Entry] = []
-        """Of those, what has its deadline still to come, the last one first; some that left may lie there."""
+        """Those of them whose deadline is still to come, latest first; entries that left may remain."""
         self.stale: list[_Entry] = []
-        """Came when it was over."""
+        """Came past their deadline."""
         self.useless: list[_Entry] = []
-        """Expire sooner than they can be answered, if the pace stays; by when they expire, the last one first."""
+        """Expire sooner than they can be answered, unless the pace rises; by expiry, latest first."""
         self.covered: list[_Entry] = []
-        """Another path takes care of them; by when they are to be looked at again."""
+        """Left to another path; sorted by when to look at them again."""
         self.passed_over = 0
         """Symbols of higher priorities that left while something waited here."""
 
@@ -166,14 +166,14 @@ class _Class:
         return self.fresh, self.hopeless, self.stale, self.useless, self.covered
 
     def look_for_newest(self, now: float) -> None:
-        """Make `newest` again from `hopeless`."""
+        """Rebuild `newest` from `hopeless`."""
         ahead = ((-entry.message.deadline, order, entry) for _, order, entry in self.hopeless)
         self.newest[:] = [item for item in ahead if -item[0] > now]
         heapq.heapify(self.newest)
 
 
 class SendQueue:
-    """Symbols that wait for one path. How many messages there are at most is the outbox's business."""
+    """Symbols that wait for one path. The outbox limits the number of messages."""
 
     __slots__ = ("_classes", "_entries", "_order", "_purge_at", "expired")
 
@@ -183,7 +183,7 @@ class SendQueue:
         self._order = count()
         self._purge_at = PURGE_AT
         self.expired = 0
-        """Messages dropped because their time was over."""
+        """Messages dropped because they expired."""
 
     def __len__(self) -> int:
         return len(self._entries)
@@ -213,7 +213,7 @@ class SendQueue:
         heapq.heappush(mine.fresh, (message.deadline, next(self._order), entry))
 
     def _purge(self) -> None:
-        """Let go of what is over but has not come up yet, so that it holds no memory."""
+        """Drop messages that are over but have not come up yet, so that they hold no memory."""
         for each in self._classes:
             for heap in each.heaps():
                 heap[:] = [item for item in heap if not item[2].message.over]
@@ -224,7 +224,7 @@ class SendQueue:
         self._purge_at = max(PURGE_AT, 2 * len(self._entries))
 
     def take(self, now: float, budget: int, pace: float = 0.0, round_trip_s: float = 0.0) -> Run | None:
-        """Remove and return what leaves next, of at most about `budget` bytes but at least one symbol.
+        """Remove and return what leaves next: at most about `budget` bytes, but at least one symbol.
 
         Messages that are over or expired are dropped on the way. `pace` (bytes a second, 0 when unknown) and
         `round_trip_s` tell which can still make their deadline.
@@ -268,7 +268,7 @@ class SendQueue:
         return None
 
     def _head(self, each: _Class, now: float, pace: float, round_trip_s: float) -> list[_Entry] | None:
-        """Return the heap whose head goes next; heads that are over go, those that change places do so."""
+        """Return the heap whose head goes next; drop heads that are over, and move those that belong elsewhere."""
         self._hope_again(each, now, pace, round_trip_s)
         covered = each.covered
         while covered and covered[0][2].covered_until(now, pace, round_trip_s) is None:
@@ -304,7 +304,7 @@ class SendQueue:
         return None
 
     def _hope_again(self, each: _Class, now: float, pace: float, round_trip_s: float) -> None:
-        """Bring back what can make its deadline after all, as the pace rose: if any, then the newest."""
+        """Bring back messages that can make their deadline after all, as the pace rose: if any can, the newest does."""
         newest = each.newest
         while newest:
             message = newest[0][2].message
@@ -329,7 +329,7 @@ class SendQueue:
 
     @staticmethod
     def _move(heap: list[_Entry], to: list[_Entry], by: float) -> None:
-        """Move the head; what is begun stays in front."""
+        """Move the head; begun messages stay in front."""
         _, order, entry = heapq.heappop(heap)
         heapq.heappush(to, (BEGUN if entry.begun else by, order, entry))
 

@@ -1,4 +1,4 @@
-"""How a path is at one moment, for people: what `plr doctor` shows of it."""
+"""Describes the state of a path at one moment, for people, as `plr doctor` shows it."""
 
 from __future__ import annotations
 
@@ -13,33 +13,33 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class PathView:
-    """One path; read field by field while its thread goes on, so that two of them may be a datagram apart."""
+    """One path. It is read field by field while its thread goes on, so two fields may be a datagram apart."""
 
     id: PathId
     state: PathState
     remote: Address | None
-    """Where it leads."""
+    """Where the path leads."""
     candidates: int
-    """How many addresses of the peer are known, at which it may be."""
+    """Number of known addresses at which the peer may be."""
     smoothed_rtt_s: float
-    """0 while none is known."""
+    """0 while unknown."""
     sent: int
     """Datagrams since the path is known."""
     lost: int
     spurious: int
-    """Of the lost: acknowledged after all."""
+    """Lost datagrams that were acknowledged after all."""
     max_datagram: int
-    """Bytes of UDP payload that it is known to carry."""
+    """Bytes of UDP payload that the path is known to carry."""
     proven_at: float
-    """When its peer last proved that it lives, or the path was made (monotonic, s)."""
+    """When its peer last proved that it lives, or when the path was made (monotonic, s)."""
     used_at: float
-    """When something other than probes last travelled, or the path was made (monotonic, s)."""
+    """When something other than probes last travelled, or when the path was made (monotonic, s)."""
     probe_every_s: float
-    """How often it is probed now, about, if it is up."""
+    """Approximate time between probes while the path is up."""
 
 
 def view_of(path: Path, now: float) -> PathView:
-    """Return how `path` is."""
+    """Return the current view of `path`."""
     recovery, probing = path.recovery, path.probing
     return PathView(
         path.id,

@@ -1,1 +1,1 @@
-"""How fast one path may send: round trips, rate, window, queue, policer. Imports nothing of the core."""
+"""Controls congestion on one path: round trips, rate, window, queue, policer. Imports nothing of the core."""

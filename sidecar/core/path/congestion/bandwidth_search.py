@@ -1,4 +1,4 @@
-"""Whether a path carries more than is asked of it: by doubling at first, by asking for a quarter more now and then.
+"""Finds out whether a path carries more: by doubling at first, then by sending a quarter more now and then.
 
 Rates in bytes a second, times in seconds. After BBR's Startup and ProbeBW (draft-ietf-ccwg-bbr sections 5.3.1, 5.3.3).
 """
@@ -13,20 +13,20 @@ if TYPE_CHECKING:
     from sidecar.core.path.congestion.delivery_rate import DeliveryRate
 
 CYCLE = (1.25, 0.75, 1.0, 1.0, 1.0, 1.0, 1.0, 1.0)
-"""Pacing gains round by round: ask for more, drain what that queued, cruise (BBR's ProbeBW)."""
+"""Pacing gains round by round: send more, drain what that queued, cruise (BBR's ProbeBW)."""
 CRUISING = 2
-"""Where in the cycle a path begins whose rate was just found."""
+"""Position in the cycle at which a path begins whose rate was just found."""
 PROBE_GROWTH = 1.1
-"""Asking for more found that much: ask again at once."""
+"""Growth of the rate that makes the path search again at once."""
 FULL_GROWTH = 1.25
 FULL_ROUNDS = 3
 """The path is full when the rate did not grow by FULL_GROWTH within FULL_ROUNDS ..."""
 QUEUED_ROUNDS = 2
-"""... or when a queue stands for so many: in a single round, all may have waited for a busy host's thread."""
+"""... or when a queue stands for this many: in a single round, all may have waited for a busy host's thread."""
 
 
 class BandwidthSearch:
-    """Told of every round of start-up (`is_full`) and of cruising (`finds_more`)."""
+    """The search for more bandwidth, fed with every round of start-up (`is_full`) and of cruising (`finds_more`)."""
 
     __slots__ = ("_cycle", "_full_rate", "_full_rounds", "_queued_rounds", "_rate_before")
 
@@ -40,7 +40,7 @@ class BandwidthSearch:
     # -- doubling -------------------------------------------------------------------------------------------------
 
     def restart(self) -> None:
-        """The path may carry any number of times more: it is full when doubling finds no more."""
+        """Begin doubling: the path may carry any number of times more, and is full when doubling finds no more."""
         self._full_rate = 0.0
         self._full_rounds = 0
         self._queued_rounds = 0
@@ -51,7 +51,7 @@ class BandwidthSearch:
         return self._queued_rounds > 0
 
     def is_full(self, rate: DeliveryRate, *, queued: bool) -> bool:
-        """Whether doubling ends with this round; `queued`: a queue stood in it."""
+        """Return whether doubling ends with this round; `queued`: a queue stood in it."""
         self._queued_rounds = self._queued_rounds + 1 if queued else 0
         if rate.limited_by_sender:
             return False
@@ -65,16 +65,16 @@ class BandwidthSearch:
     # -- asking for a quarter more --------------------------------------------------------------------------------
 
     def begin_cycle(self) -> None:
-        """The rate was just found, or is to be kept for the moment."""
+        """Begin to cruise: the rate was just found, or is to be kept for the moment."""
         self._cycle = CRUISING
 
     @property
     def gain(self) -> float:
-        """What to send in this round of cruising, over the rate believed in."""
+        """The pacing gain of this round of cruising, relative to the estimated rate."""
         return CYCLE[self._cycle]
 
     def finds_more(self, settled: float, *, queued: bool) -> bool:
-        """Whether asking for more found more in the round that ends; if not, go to the next gain.
+        """Return whether sending more found more in the round that ends; if not, go to the next gain.
 
         `settled` is the rate measured. What was sent at the first gain is acknowledged by the end of the second round.
         """
@@ -87,9 +87,9 @@ class BandwidthSearch:
 
 
 def is_faster(rate: float, round_max_rtt: float, min_rtt: float) -> bool:
-    """Whether the second datagram of a burst waited for the first for much less time than it takes at this rate.
+    """Return whether a burst's second datagram waited for the first much less than this rate implies.
 
-    `round_max_rtt` is the longest round trip of a round. On a slow path a round is too few datagrams to measure a
+    `round_max_rtt` is the longest round trip of a round. On a slow path a round has too few datagrams to measure a
     quarter more, while its rate may be a hundredfold.
     """
     waits_s = DATAGRAM_BYTES / rate if rate else 0.0

@@ -1,7 +1,7 @@
-"""How much may be under way on one path, and when the next burst may leave.
+"""Decides how much may be in flight on one path, and when the next burst may leave.
 
-A model of the path, after BBR (draft-ietf-ccwg-bbr): the rate at which it delivers and the round trip of its empty
-queue say how fast to send and how much to have in flight. Losses that mean congestion put a ceiling on that. Why so:
+It models the path after BBR (draft-ietf-ccwg-bbr): the delivery rate and the round trip of an empty queue say how fast
+to send and how much to have in flight. Losses that mean congestion put a ceiling on that. For the reasons see
 docs/develop/adr/0010-congestion-by-model-and-ceiling.md.
 """
 
@@ -20,40 +20,41 @@ if TYPE_CHECKING:
     from sidecar.core.path.congestion.rtt import RttEstimator
 
 INITIAL_WINDOW_BYTES = 32 * 1024
-"""May leave at once on a path of which nothing is known: within what browsers do (RFC 6928 says 14 kB for TCP), and
-so that small requests never wait for an estimate."""
+"""Bytes that may leave at once on an unknown path: within what browsers do (RFC 6928 says 14 kB for TCP), and such that
+small requests never wait for an estimate."""
 MIN_WINDOW_BYTES = 4 * DATAGRAM_BYTES
-"""Always allowed in flight: keeps acknowledgements coming (RFC 8085 section 3.1 asks for a small minimum)."""
+"""Always allowed in flight, to keep acknowledgements coming (RFC 8085 section 3.1 asks for a small minimum)."""
 MAX_WINDOW_BYTES = 16 * 1024 * 1024
-"""Never more in flight: 1 Gbit/s over 134 ms."""
+"""Most bytes in flight: 1 Gbit/s over 134 ms."""
 MAX_BURST_BYTES = 64 * 1024
 """Largest burst between two pauses: one segmentation offload."""
 UNPROVEN_S = 0.005
-"""Where nothing confirmed the rate for some time, the first burst is what it carries in this time, and no less than on
-an unknown path: after a fall to a fiftieth, a quarter of a second in the modem. Its acknowledgements prove the rate."""
+"""If nothing confirmed the rate for some time, the first burst is what the path carries in this time, and no less than
+on an unknown path: after a fall to a fiftieth, a quarter of a second in the modem. Its acknowledgements prove the rate.
+"""
 BURST_S = 0.001
-"""A burst is what the path carries in this time, where that is more than two datagrams."""
+"""A burst is what the path carries in this time, if that is more than two datagrams."""
 LATE_S = 0.025
-"""A sender woken late makes up for at most this much time: a busy host's threads wait for their turn. What it does not
-make up for keeps its pace below the rate it believes in, and asking for a quarter more may then ask for nothing."""
+"""Most time that a sender woken late makes up for: a busy host's threads wait for their turn. Any further lateness
+keeps its pace below the estimated rate, and then sending a quarter more may ask for nothing."""
 PAUSE_S = 0.004
 """After a pause, what the path carries in this time may leave at once: on a fast path, a whole small request."""
 WINDOW_GAIN = 2.0
-"""Bandwidth-delay products in flight: what acknowledgements that come in clumps need."""
+"""Bandwidth-delay products in flight: what clumped acknowledgements need."""
 STARTUP_GAIN = 2.0
-"""The rate at most doubles with each round at first, as in slow start."""
+"""At first the rate at most doubles with each round, as in slow start."""
 DRAIN_GAIN = 0.5
-"""After start-up, until its queue is gone."""
+"""Gain after start-up, until its queue is gone."""
 DRAIN_ROUNDS = 3
-"""Draining ends after so many rounds: what still stands then is not ours."""
+"""Draining ends after this many rounds: a queue that still stands then is not ours."""
 QUEUE_FACTOR = 0.25
 """A round trip this much above the minimum shows a queue."""
 PROBE_AGAIN_S = 1.0
-"""A queue that stands although we keep to our window makes us look for the minimum no more often than this."""
+"""Least time between two searches for the minimum because a queue stands although we keep to our window."""
 MINIMUM_STALE_S = 5.0
 """A minimum round trip not seen for this long is looked for, with half the window, before it is forgotten."""
 OUTAGE_FRACTION = 0.5
-"""What a path that was down is believed to carry of what it carried before."""
+"""Share of its earlier rate that a path is believed to carry after it was down."""
 PERSISTENT_FACTOR = 3
 """Probe timeouts without any acknowledgement that make congestion persistent (RFC 9002 section 7.6.1)."""
 
@@ -62,11 +63,11 @@ class RateSample(NamedTuple):
     """What one acknowledgement tells of the datagrams that were reported with `on_sent`."""
 
     acked_bytes: int
-    """Newly acknowledged by it."""
+    """Bytes that it newly acknowledges."""
     sent_at: float
-    """When the newest datagram among those left (s)."""
+    """When the newest of those datagrams left (s)."""
     rtt_s: float
-    """Round trip of that datagram; 0 when it is not the largest acknowledged, so that nothing was measured."""
+    """Round trip of that datagram; 0 if it is not the largest acknowledged, so that nothing was measured."""
     in_flight: int
     """Bytes in flight after it."""
 
@@ -123,7 +124,7 @@ class CongestionController:
         self._rate_before_silence = 0.0
         self._search = BandwidthSearch()
         self._unproven_bytes: float | None = None
-        """In flight at most, until a burst's first acknowledgements prove a rate that nothing confirmed for long."""
+        """Most bytes in flight until a burst's first acknowledgements prove a rate that nothing confirmed for long."""
         self._phase_rounds = 0
         self._standing_rounds = 0
         self._believed_before = 0.0
@@ -164,7 +165,7 @@ class CongestionController:
         return allowed_s if policed is None else min(allowed_s, self.policer.burst / policed)
 
     def next_release(self, in_flight: int) -> float | None:
-        """Return when pacing lets more leave (it may have passed); None when only an acknowledgement can."""
+        """Return when pacing lets more leave, even if past; None if only an acknowledgement can."""
         if in_flight >= self.window or self.pacing_rate is None:
             return None
         return self._release_at
@@ -192,7 +193,7 @@ class CongestionController:
 
     @property
     def pacing_rate(self) -> float | None:
-        """Bytes a second; None while nothing is known of the path."""
+        """Bytes a second; None while the path is unknown."""
         model, policed = self._model_pace(), self.policer.rate
         return model if model is None or policed is None else min(model, policed)
 
@@ -213,7 +214,7 @@ class CongestionController:
     # -- being told -----------------------------------------------------------------------------------------------
 
     def on_sent(self, now: float, size: int, in_flight: int) -> None:
-        """These bytes left; `in_flight` includes them."""
+        """Note that these bytes left; `in_flight` includes them."""
         allowance_s = self._allowance_s
         self.rate.on_sent(now)
         self.policer.on_sent(now)
@@ -226,7 +227,7 @@ class CongestionController:
             self._release_at = max(self._release_at, now - allowance_s) + size / pace
 
     def ran_dry(self) -> None:
-        """More might leave, but nothing waits: what is delivered from here on says little of what the path can."""
+        """Note that nothing waits although more may leave: later deliveries say little of what the path can carry."""
         self.rate.ran_dry()
         self.policer.ran_dry()
 
@@ -258,7 +259,7 @@ class CongestionController:
             self._end_round(rtt, now)
 
     def _ceiling_binds(self, rtt: RttEstimator) -> bool:
-        """Whether less is in flight than the path holds, so that a round without a queue tells nothing of its rate."""
+        """Return whether less is in flight than the path holds, so that a round without a queue tells no rate."""
         if self.ceiling.bytes is None or self.ceiling.bytes >= self._model_window():
             return False
         return not self._stands(self._round_min_rtt, rtt)
@@ -268,18 +269,18 @@ class CongestionController:
         return rtt.minimum + QUEUE_FACTOR * rtt.minimum + END_HOST_S < round_min_rtt < float("inf")
 
     def on_lost(self, lost_bytes: int, sent_at: float, in_flight: int, now: float) -> None:
-        """These bytes were lost, the newest of them sent at `sent_at`; `in_flight` is what is left."""
+        """Take a loss of these bytes, the newest of them sent at `sent_at`; `in_flight` is what is left."""
         rtt = self._rtt
         if rtt is None or sent_at <= self._collapsed_at:
-            return  # that was answered by beginning again with the least, and says nothing of what is sent since
+            return  # the restart at the minimum answered that loss, which says nothing of what is sent since
         # What start-up overflows fills in one round: nothing stands yet.
         queued = self.phase is Phase.STARTUP and self._stands(self._round_max_rtt, rtt)
         queued = queued or self.ceiling.meets_queue(rtt)
         if self.policer.on_lost(lost_bytes, sent_at, rtt.smoothed, now, queued=queued):
             self.ceiling.forget()
             return
-        # What the path is known to carry, if the application asked for less: a loss among few bytes in flight does
-        # not tell that the path ends there, and a ceiling that low would take many seconds to grow back.
+        # Count what the path is known to carry, if the application asked for less: a loss among few bytes in flight
+        # does not show that the path ends there, and a ceiling that low would take many seconds to grow back.
         known = int(self.rate.best * rtt.minimum)
         if not self.ceiling.on_lost(lost_bytes, sent_at, max(in_flight, known), rtt, now):
             return
@@ -287,21 +288,21 @@ class CongestionController:
             self._enter(Phase.DRAIN)
 
     def on_probe_timeout(self, now: float) -> None:
-        """Nothing was heard: two datagrams may leave whatever is in flight (RFC 9002 section 7.5)."""
+        """Let two datagrams leave whatever is in flight, since nothing was heard (RFC 9002 section 7.5)."""
         self._probe_credit = 2 * DATAGRAM_BYTES
         rtt = self._rtt
         if rtt is not None and now - self._silent_since > PERSISTENT_FACTOR * rtt.probe_timeout(END_HOST_S):
             self._collapse(rtt, now)
 
     def on_path_down(self) -> None:
-        """The path is dead."""
+        """Note that the path is dead."""
         self._was_down = True
         self.rate.restart(OUTAGE_FRACTION * max(self.rate.best, self._rate_before_silence))
         self._rate_before_silence = 0.0
         self.ceiling.forget()
 
     def on_path_up(self, now: float) -> None:
-        """The path answers; after an outage, start from a part of what it carried, and look for more."""
+        """Note that the path answers; after an outage, start from a share of its earlier rate, and look for more."""
         if not self._was_down:
             return
         self._was_down = False
@@ -349,7 +350,7 @@ class CongestionController:
                 self._probe_min_rtt = float("inf")
 
     def _probe_rtt(self, sample: RateSample, rtt: RttEstimator, now: float) -> None:
-        """With little of ours in flight for a round trip, what remains of the queue is others'."""
+        """Look for the minimum: with little of ours in flight for a round trip, the remaining queue is others'."""
         self._probe_min_rtt = min(self._probe_min_rtt, sample.rtt_s)
         if self._drained_at is None:
             if sample.in_flight <= self.window:
@@ -363,7 +364,7 @@ class CongestionController:
             self._cruise()
 
     def _look_for_more(self) -> None:
-        """The path carries more than we thought: as much as doubling finds."""
+        """Search again by doubling, since the path carries more than estimated."""
         self._enter(Phase.STARTUP)
         self._first_window = float(MIN_WINDOW_BYTES)
         self._search.restart()
@@ -377,7 +378,7 @@ class CongestionController:
         self._search.begin_cycle()
 
     def _collapse(self, rtt: RttEstimator, now: float) -> None:
-        """Persistent congestion: begin again with the least (RFC 9002 section 7.6.2), unless it was an outage."""
+        """Restart at the minimum after persistent congestion (RFC 9002 section 7.6.2), unless it was an outage."""
         self._collapsed_at = now
         self._rate_before_silence = max(self._rate_before_silence, self.rate.best)
         self.rate.restart(MIN_WINDOW_BYTES / max(rtt.smoothed, 1e-3))
@@ -388,5 +389,5 @@ class CongestionController:
 
 
 def burst(pace: float) -> float:
-    """Bytes that leave together at a pacing rate (bytes a second)."""
+    """Return the bytes that leave together at a pacing rate (bytes a second)."""
     return max(2.0 * DATAGRAM_BYTES, min(pace * BURST_S, MAX_BURST_BYTES))

@@ -1,9 +1,9 @@
-"""The rate at which one path delivers, from the spacing of acknowledgements.
+"""Estimates the rate at which one path delivers, from the spacing of acknowledgements.
 
-Measured over trains: datagrams sent one after the other without a pause for want of data. A train is cut into rounds
-of at least a round trip. The rate of a round is what was acknowledged in it over the time this took, or over the time
-the sender took, whichever is longer (after draft-cheng-iccrg-delivery-rate-estimation, without state per datagram). A
-pause between two requests belongs to no train: a burst of a few datagrams measures the path and not the application.
+It measures trains: datagrams sent one after the other without a pause for lack of data. A train is cut into rounds of
+at least a round trip. The rate of a round is the bytes acknowledged in it over the time this took, or over the time the
+sender took, whichever is longer (after draft-cheng-iccrg-delivery-rate-estimation, without state per datagram). A pause
+between two requests belongs to no train, so a burst of a few datagrams measures the path and not the application.
 """
 
 from __future__ import annotations
@@ -13,24 +13,24 @@ from collections import deque
 MIN_ROUND_BYTES = 8 * 1200
 """A rate of fewer bytes is noise."""
 LIMITED_FACTOR = 1.5
-"""Acknowledgements this much further apart than what they acknowledge show the path's rate, not the sender's. Less may
-be a host that was slow to wake."""
+"""Acknowledgements this much further apart than what they acknowledge show the path's rate, not the sender's. A smaller
+factor may come from a host that was slow to wake."""
 ROUNDS = 10
-"""The best of so many rounds counts (BBR's filter)."""
+"""The best of this many rounds counts (BBR's filter)."""
 BELIEVED_ROUNDS = 2
-"""What is left of these when they contradict a standing queue."""
+"""Rounds that remain when they contradict a standing queue."""
 MAX_TRAINS = 256
-"""Trains under way; beyond that, the oldest are taken for one."""
+"""Trains under way; beyond that, the oldest ones count as one."""
 CONFIRMS = 0.5
 """A train at this share of the rate confirms it: trains are paced, in some rounds at three quarters of the rate."""
 PROVES_BYTES = 2 * MIN_ROUND_BYTES
-"""The spacing of so much confirms a rate, or takes the place of one that nothing confirmed for long."""
+"""Bytes whose spacing confirms a rate, or replaces one that nothing confirmed for long."""
 FRESH_S = 3.0
-"""A rate is relied upon for so long after it was last confirmed."""
+"""A rate is relied upon for this long after it was last confirmed."""
 
 
 class DeliveryRate:
-    """Best delivery rate of the last rounds, bytes a second; 0 when unknown."""
+    """Best delivery rate of the last rounds, bytes a second; 0 while unknown."""
 
     __slots__ = (
         "_anchor_at",
@@ -50,15 +50,15 @@ class DeliveryRate:
     def __init__(self) -> None:
         self.best = 0.0
         self.settled = 0.0
-        """The best of complete rounds, without the present one."""
+        """The best of complete rounds, without the current one."""
         self.limited_by_sender = True
-        """Whether the last complete round says no more than what was offered."""
+        """Whether the last complete round shows no more than what was offered."""
         self._rounds: deque[float] = deque(maxlen=ROUNDS)
         self._trains: deque[float] = deque()
         self.is_dry = True
-        """Whether what is sent next begins a train."""
+        """Whether the next datagram begins a train."""
         self.confirmed_at = float("-inf")
-        """When a train last went at about the best rate (s)."""
+        """When a train last reached about the best rate (s)."""
         self._anchor_at: float | None = None
         self._anchor_sent_at = 0.0
         self._bytes = 0
@@ -66,7 +66,7 @@ class DeliveryRate:
         self._limited = True
 
     def on_sent(self, now: float) -> None:
-        """Something left."""
+        """Note that something left."""
         if self.is_dry:
             self.is_dry = False
             if len(self._trains) >= MAX_TRAINS:
@@ -74,13 +74,13 @@ class DeliveryRate:
             self._trains.append(now)
 
     def ran_dry(self) -> None:
-        """Nothing waits to be sent: what is sent next begins a train."""
+        """Note that nothing waits to be sent: the next datagram begins a train."""
         self.is_dry = True
 
     def on_acked(self, size: int, sent_at: float, now: float, limit: float, *, held_back: bool = False) -> bool:
-        """Take newly acknowledged bytes, the newest of them sent at `sent_at`; True when that ended a round.
+        """Take newly acknowledged bytes, the newest of them sent at `sent_at`; return True if that ended a round.
 
-        A round in which the controller held back says as little against a better one as a round for want of data. No
+        A round in which the controller held back says as little against a better one as a round for lack of data. No
         round is believed beyond `limit`: acknowledgements that come in clumps may show any rate.
         """
         trains = self._trains
@@ -107,7 +107,7 @@ class DeliveryRate:
         return False
 
     def _confirm(self, now: float, acked_s: float, sent_s: float, limit: float) -> None:
-        """Take what the train shows so far for a proof of the best rate, or against one not proven for long."""
+        """Let the train so far confirm the best rate, or replace one that nothing confirmed for long."""
         if self._bytes < PROVES_BYTES:
             return
         rate = min(self._bytes / max(acked_s, sent_s, 1e-9), limit)
@@ -126,11 +126,11 @@ class DeliveryRate:
         self._limited = True
 
     def is_confirmed(self, now: float) -> bool:
-        """Whether the best rate may be relied upon: the path may have changed since it was confirmed."""
+        """Return whether the best rate may be relied upon: the path may have changed since it was confirmed."""
         return now - self.confirmed_at <= FRESH_S
 
     def _close(self, *, sender: bool) -> bool:
-        """End the round; `sender`: for want of data. A round that the sender limited can only raise the rate."""
+        """End the round; `sender`: for lack of data. A round that the sender limited can only raise the rate."""
         rate = self._rate
         if not rate:
             return False
@@ -151,13 +151,13 @@ class DeliveryRate:
         self.best = max(self.settled, self._rate)
 
     def believe_latest(self) -> None:
-        """Forget all but the latest rounds: a queue that stands shows that they were too good."""
+        """Forget all but the latest rounds: a standing queue shows that the others were too high."""
         while len(self._rounds) > BELIEVED_ROUNDS:
             self._rounds.popleft()
         self._update()
 
     def restart(self, rate: float) -> None:
-        """Begin again with this rate."""
+        """Start over with this rate."""
         self._rounds.clear()
         if rate:
             self._rounds.append(rate)

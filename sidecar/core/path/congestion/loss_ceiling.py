@@ -1,9 +1,9 @@
-"""A ceiling on the bytes in flight of one path, cut by losses that mean congestion.
+"""Puts a ceiling on the bytes in flight of one path, cut by losses that mean congestion.
 
 Radio links lose datagrams without being full, so a loss alone says nothing. Congestion is a loss while a queue stands,
-when such losses are clearly more frequent than those without one; where there are hardly any without one, a single
-loss that met a full queue; and heavy loss in any case. The ceiling then falls and grows again as CUBIC's window does
-(RFC 9438), so that TCP at the same bottleneck keeps its share.
+if such losses are clearly more frequent than those without one. If there are hardly any without one, it is a single
+loss that met a full queue. Heavy loss means congestion in any case. The ceiling then falls and grows again as CUBIC's
+window does (RFC 9438), so that TCP at the same bottleneck keeps its share.
 """
 
 from __future__ import annotations
@@ -17,32 +17,32 @@ if TYPE_CHECKING:
     from sidecar.core.path.congestion.rtt import RttEstimator
 
 CUT = 0.7
-"""What a cut leaves (CUBIC's beta, RFC 9438 section 4.6)."""
+"""Share that a cut leaves (CUBIC's beta, RFC 9438 section 4.6)."""
 CUBIC_C = 0.4
 """Growth, datagrams per cubed second (RFC 9438 section 5)."""
 LEAST_BYTES = 4 * DATAGRAM_BYTES
 SIGNIFICANT = 2.0
-"""A queue's losses are congestion when they are this many times as frequent as those without a queue."""
+"""A queue's losses are congestion if they are this many times as frequent as those without a queue."""
 UNUSUAL = 0.005
-"""Where less than this share is lost without a queue, a single loss is congestion if it met a full queue. Else the
-losses that a radio has now and then would cut again and again wherever the route becomes longer for a while."""
+"""If less than this share is lost without a queue, a single loss is congestion if it met a full queue. With more, the
+occasional losses of a radio would cut again and again whenever the route becomes longer for a while."""
 MEMORY_BYTES = 500 * DATAGRAM_BYTES
-"""Over how much the frequency of losses without a queue is measured."""
+"""Bytes over which the frequency of losses without a queue is measured."""
 MEMORY_S = 10.0
-"""... and how long it is known where a queue always stands, whose own losses would pass for usual if that was wrong."""
+"""... and how long it holds where a queue always stands: if it was wrong, that queue's losses would pass for usual."""
 HEAVY_LOSS = 0.2
 HEAVY_BYTES = 8 * DATAGRAM_BYTES
-"""Losing this share and this much of what was sent of late is congestion even without a queue: a policer, a tiny
-buffer. Of late: a window, not the round, because on a busy host one acknowledgement tells first that most of a
-window arrived, which ends a round, and then what is missing from it."""
+"""Losing this share and this much of what was recently sent is congestion even without a queue: a policer, a tiny
+buffer. Recent is a window, not the round: on a busy host one acknowledgement first says that most of a window arrived,
+which ends a round, and then what is missing from it."""
 PATIENCE_ROUNDS = 20
 PATIENCE_S = 1.0
-"""A ceiling that a queue's losses set is left alone for so long: others that yielded as well come back by then."""
+"""A ceiling that a queue's losses set is left alone for this long: others that also yielded come back by then."""
 RECENT_BYTES = 64 * DATAGRAM_BYTES
-"""The least that counts as of late."""
+"""Least number of bytes that counts as recent."""
 REGAIN = 1.25
-"""A ceiling that binds grows this much with each round that neither met a queue nor lost more than usual. It need not
-find where the path ends: the model of the path, whose rate is what was delivered, sees to that."""
+"""A ceiling that binds grows by this factor with each round that neither met a queue nor lost more than usual. It need
+not find where the path ends: the model of the path, whose rate is what was delivered, does that."""
 
 
 class LossCeiling:
@@ -86,8 +86,8 @@ class LossCeiling:
         self._queued = False
         self._queue_before = False
         self._unclear = True
-        """Whether what this round loses says nothing of what is usual: a cut was made for it; or it is the first,
-        which sends a burst into a path of which nothing is known."""
+        """Whether this round's losses say nothing of the usual loss: because of a cut for them, or because it is the
+        first round, which sends a burst into an unknown path."""
         self._usual_bytes = 0.0
         self._usual_lost = 0.0
         self._usual_at = 0.0
@@ -95,17 +95,17 @@ class LossCeiling:
         self._queue = StandingQueue()
 
     def on_sent(self, in_flight: int) -> None:
-        """So many bytes are in flight."""
+        """Note the bytes in flight."""
         self._most_in_flight = max(self._most_in_flight, in_flight)
 
     def on_acked(self, size: int, rtt_s: float, rtt: RttEstimator, wanted: float, now: float) -> None:
-        """Grow. `wanted` is the window without a ceiling; one that is far above it is forgotten."""
+        """Grow. `wanted` is the window without a ceiling; a ceiling far above it is forgotten."""
         self._acked += size
         self._note_recent(size)
         if rtt_s:
             change = self._queue.note(rtt_s, rtt, now)
             if change is FloorChange.FELL:
-                self._usual_bytes = self._usual_lost = 0.0  # learnt with others' queue taken for none
+                self._usual_bytes = self._usual_lost = 0.0  # learned while others' queue counted as none
             elif change is FloorChange.ROSE and self._queue_cut:
                 self.forget()
                 self._queued = self._queue_before = False
@@ -116,7 +116,7 @@ class LossCeiling:
                 self.forget()
 
     def on_lost(self, size: int, sent_at: float, in_flight: int, rtt: RttEstimator, now: float) -> bool:
-        """Take a loss, the newest datagram of it sent at `sent_at`; True when it cut the ceiling."""
+        """Take a loss, the newest datagram of it sent at `sent_at`; return True if it cut the ceiling."""
         self._lost += size
         self._note_recent(size)
         self._recent_lost += size
@@ -130,7 +130,7 @@ class LossCeiling:
         before = float(max(in_flight + size, self._most_in_flight))
         if self.bytes is not None:
             before = min(before, self.bytes)
-        # Fast convergence (RFC 9438 section 4.7): who has to yield twice leaves room for others.
+        # Fast convergence (RFC 9438 section 4.7): a flow that yields twice leaves room for others.
         self._top = before if before >= self._top else before * (1 + CUT) / 2
         self._start = self.bytes = max(CUT * before, LEAST_BYTES)
         self._at = now
@@ -140,11 +140,11 @@ class LossCeiling:
         return True
 
     def meets_queue(self, rtt: RttEstimator) -> bool:
-        """Whether what is lost now may have met a queue."""
+        """Return whether what is lost now may have met a queue."""
         return self._queued or self._queue_before or self._queue.stands(rtt)
 
     def end_round(self, rtt: RttEstimator, now: float) -> None:
-        """A round trip is over. What it lost while no datagram met a queue, nor in the one before, is usual."""
+        """End a round trip. Its loss is usual if no datagram met a queue in it, nor in the one before."""
         if not self._queued and not self._queue_before and not self._unclear and not self._is_heavy():
             self._regain(rtt, now)
             self._usual_at = now
@@ -178,7 +178,7 @@ class LossCeiling:
         self._recent += size
 
     def forget(self) -> None:
-        """No ceiling."""
+        """Remove the ceiling."""
         self.bytes = None
         self._top = 0.0
         self._at = float("-inf")
@@ -195,7 +195,7 @@ class LossCeiling:
         return self._recent_lost > max(HEAVY_LOSS * self._recent, HEAVY_BYTES)
 
     def _is_unusual(self, *, full: bool) -> bool:
-        """Whether more was lost of late than without a queue; `full`: whether the last loss met a full one."""
+        """Return whether recent loss exceeds the loss without a queue; `full`: the last loss met a full one."""
         if full and self._usual_lost <= UNUSUAL * self._usual_bytes:
             return True
         usual = self._usual_lost / max(self._usual_bytes, self._recent) * self._recent

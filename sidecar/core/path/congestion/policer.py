@@ -1,10 +1,10 @@
-"""The token rate of a policer on one path: carriers drop what exceeds a token bucket, without queueing it.
+"""Finds the token rate of a policer on one path: carriers drop what exceeds a token bucket, without queueing it.
 
-The bucket is empty whenever it drops. What arrives of what left between two losses, while there was always something
-to send, is therefore what the tokens allowed; and below that rate nothing is dropped. Loss at random looks the same at
-one rate, but does not end at a lower one, so a rate found is tried first. (After Flach et al., "An Internet-Wide
-Analysis of Traffic Policing", 2016, and the long-term bandwidth of BBRv1. Times are those of sending: a bucket knows of
-no acknowledgements.)
+The bucket is empty whenever it drops. So what arrives of the bytes that left between two losses, while there was always
+something to send, is what the tokens allowed; and below that rate nothing is dropped. Random loss looks the same at one
+rate, but does not end at a lower one, so a rate found is tried first. (After Flach et al., "An Internet-Wide Analysis
+of Traffic Policing", 2016, and the long-term bandwidth of BBRv1. Times are those of sending: a bucket knows of no
+acknowledgements.)
 """
 
 from __future__ import annotations
@@ -14,66 +14,66 @@ from collections import deque
 from sidecar.core.path.congestion.units import DATAGRAM_BYTES
 
 SUSPECT_LOSS = 0.1
-"""Losing this share is worth a trial. Nobody who knows of no policer loses much less to it; radios mostly do."""
+"""Losing this share is worth a trial. A sender that knows of no policer hardly loses less to it; radios mostly do."""
 KNOWN_LOSS = 0.02
-"""Losing this share (the loss threshold of draft-ietf-ccwg-bbr) below its rate is, where one is known."""
+"""The same share once a policer is known, below its rate (the loss threshold of draft-ietf-ccwg-bbr)."""
 SUSPECT_BYTES = 12 * DATAGRAM_BYTES
-"""Fewer losses tell no share."""
+"""Fewer losses give no share."""
 SUSPECT_RUNS = 3
 RUNS_S, RUNS_ROUNDS = 0.75, 4.0
-"""So many losses with something between them that arrived, within this time or as many round trips. What exceeds a
-bucket is dropped now and then, for as long as too much is sent; a radio that fades for a moment loses everything,
-once."""
+"""Number of losses with an arrival between them, within this time or as many round trips. A bucket drops the excess now
+and then, for as long as too much is sent; a radio that fades for a moment loses everything, once."""
 MEMORY_BYTES = 400 * DATAGRAM_BYTES
-"""Over how much the share is measured while no policer is known."""
+"""Bytes over which the share is measured while no policer is known."""
 SPAN_BYTES = 10 * DATAGRAM_BYTES
 SPAN_S = 0.01
 """A rate of less is noise."""
 EXACT_BYTES = 30 * DATAGRAM_BYTES
 EXACT_S = 0.1
-"""Measured over this much, a rate is known to MARGIN; or over this time, when less is lost than this is worth."""
+"""Measured over this much, a rate is known to MARGIN; or over this time, if the rate carries less than that in it."""
 TRIAL_LOSSES = 12
-"""A trial lasts for as many datagrams as would lose so many if the losses were at random."""
+"""A trial lasts for as many datagrams as would lose this many if the losses were random."""
 RANDOM = 0.6
-"""They are if at least this share of them is lost all the same ..."""
+"""The losses are random if at least this share of them goes on in the trial ..."""
 POLICED = 0.25
-"""... and not if it is at most this; between these, the rate found is too high, and a lower one is tried. A path that
-loses a share at random passes for policed once in 400 trials (Poisson, three or fewer of twelve)."""
+"""... and not if at most this share does. Between the two, the rate found is too high, and a lower one is tried. A path
+with random loss passes for policed once in 400 trials (Poisson, three or fewer of twelve)."""
 IN_VAIN = 3
-"""A policer whose losses go on below so many rates, one lower than the other, with bursts that any bucket holds, is
-none: a radio that is silent for 50 ms now and then loses much before a trial, and nothing in it. Each such rate would
-be lower, without an end."""
+"""A supposed policer whose losses go on below this many rates, each lower than the last, with bursts that any bucket
+holds, is none: a radio that is silent for 50 ms now and then loses much before a trial, and nothing in it. Each such
+rate would be lower, without an end."""
 TRY_AGAIN_S = 20.0
-"""After losses that were at random, a trial only after this time, or when twice as much is lost ..."""
+"""After random losses, a trial comes only after this time, or when twice as much is lost ..."""
 MAX_TRY_AGAIN_S = 640.0
-"""... and after rates tried in vain, after twice the time of before, up to this."""
+"""... and after rates tried in vain, after twice the previous time, up to this."""
 MARGIN = 0.97
-"""Of the token rate is used: what was lost before refills the bucket, and the measurement is good for a few percent."""
+"""Share of the token rate that is used: earlier losses refill the bucket, and the measurement is good to a few percent.
+"""
 GROWTH = 0.03 / 8
-"""Looking for more: the share of the rate added after `t` units of time, per cubed unit. The rate is that measured
+"""Search for more: the share of the rate added after `t` units of time, per cubed unit. It reaches the measured rate
 after two units, ..."""
 FORGET = 2.0
-"""... and this many times it after six and a half. Then there is no policer any more."""
+"""... and this many times it after six and a half. Then the policer counts as gone."""
 UNIT_S = 1.0
 UNIT_ROUNDS = 10.0
 UNIT_BYTES = 100 * DATAGRAM_BYTES
-"""A unit is the longest of these: what is lost by asking for too much is lost for some round trips."""
+"""A unit is the longest of these: whatever asking for too much loses is lost for some round trips."""
 CHANGE_ROUNDS = 2.0
 """Losses below the rate are not judged sooner than this after it was set: the bucket is still empty."""
 BURST_S = 0.025
 LEAST_BURST = 2 * DATAGRAM_BYTES
-"""What the rate allows in BURST_S may leave at once at first, as without a policer; half of it whenever losses begin
+"""What the rate allows in BURST_S may leave at once at first, as without a policer. It halves whenever losses begin
 below the rate: then the bucket holds less."""
 SMALL_BURST = 16_000
-"""Buckets hold no less (bytes): what goes on being lost with bursts of this is not lost to bursts."""
+"""Buckets hold no less (bytes): losses that go on with bursts of this size are not due to bursts."""
 CUT = 0.9
-"""What is left of the rate then, if the burst is the least already and the rate could not be measured."""
+"""What is left of the rate then, if the burst is already the least and the rate could not be measured."""
 MAX_REMEMBERED = 64
-"""Acknowledgements, and pauses for want of data, by which a span is measured."""
+"""Acknowledgements, and pauses for lack of data, that are remembered to measure a span."""
 
 
 class _Fates:
-    """Bytes whose fate is known, of those that left after some moment."""
+    """Bytes whose fate is known, among those that left after some moment."""
 
     __slots__ = ("known", "lost", "since")
 
@@ -92,7 +92,7 @@ class _Fates:
 
 
 class Policer:
-    """What the losses of one path without a queue tell. Sizes in bytes, rates in bytes a second, times in seconds."""
+    """What one path's losses without a queue tell. Sizes in bytes, rates in bytes a second, times in seconds."""
 
     __slots__ = (
         "_acks",
@@ -123,39 +123,39 @@ class Policer:
 
     def __init__(self) -> None:
         self.burst = 0.0
-        """Bytes that may leave at once, where a policer is known."""
+        """Bytes that may leave at once, if a policer is known."""
         self.was_found = False
-        """Whether a trial told that what was lost before was a policer's; who acts on it resets it."""
+        """Whether a trial showed that earlier losses were a policer's; whoever acts on it resets it."""
         self._token_rate = self._before = 0.0
-        """0: no policer is known. And what it was before the trial under way."""
+        """The token rate, 0 while no policer is known; and its value before the current trial."""
         self._fates = _Fates(float("-inf"))
         self._tried_share: float | None = None
-        """What was lost before the trial under way; None: there is none."""
+        """Share lost before the current trial; None: there is none."""
         self._found_share = 0.0
-        """What was lost before the trial that found the policer."""
+        """Share lost before the trial that found the policer."""
         self._usual = 0.0
-        """What is lost below the token rate."""
+        """Share lost below the token rate."""
         self._random = 0.0
         self._rejected_at = float("-inf")
-        """What was lost at random, and when a trial showed that."""
+        """Share of random loss, and when a trial showed it."""
         self._try_again_s = TRY_AGAIN_S
         self._in_vain = 0
-        """Lower rates tried one after the other, with the least bursts, since one held."""
+        """Lower rates tried in a row with the least bursts, since one held."""
         self._lost_at = float("-inf")
-        """When the newest that was lost left."""
+        """When the newest lost datagram left."""
         self._runs: deque[float] = deque(maxlen=SUSPECT_RUNS)
-        """When the first of each of the last losses left that have something between them that arrived."""
+        """When the first of each of the last losses left; each pair has an arrival between it."""
         self._overrun_at: float | None = None
-        """When looking for more met the policer again; its rate is measured then."""
+        """When the search for more met the policer again; its rate is measured then."""
         self._asked_s = 0.0
-        """For how long the token rate has held back what there is to send."""
+        """How long the token rate has held back what there is to send."""
         self._delivered = 0
         self._acks: deque[tuple[float, int]] = deque(maxlen=MAX_REMEMBERED)
-        """What was delivered of what had left by some time."""
+        """For some send times, the bytes delivered of what had left by then."""
         self._trains: deque[float] = deque(maxlen=MAX_REMEMBERED)
-        """When something left after a pause for want of data."""
+        """When something left after a pause for lack of data."""
         self._span: tuple[float, int] | None = None
-        """Since which loss the rate is measured: when that left, and what was delivered of what left before."""
+        """The loss since which the rate is measured: when it left, and the bytes delivered of what left before."""
         self._paused = self._dry = True
         """Whether nothing waits to be sent; whether that was so in this round."""
         self._round_at = 0.0
@@ -165,7 +165,7 @@ class Policer:
 
     @property
     def rate(self) -> float | None:
-        """Bytes a second that may be sent; None when no policer is known."""
+        """Bytes a second that may be sent; None while no policer is known."""
         return self._token_rate * self._gain if self._token_rate else None
 
     @property
@@ -179,11 +179,11 @@ class Policer:
     # -- being told -----------------------------------------------------------------------------------------------
 
     def ran_dry(self) -> None:
-        """Nothing waits to be sent."""
+        """Note that nothing waits to be sent."""
         self._paused = self._dry = True
 
     def on_sent(self, now: float) -> None:
-        """Something left."""
+        """Note that something left."""
         if self._paused:
             self._paused = False
             self._trains.append(now)
@@ -199,13 +199,13 @@ class Policer:
             fates.lost //= 2
 
     def on_lost(self, size: int, sent_at: float, rtt_s: float, now: float, *, queued: bool) -> bool:
-        """Take a loss, the newest datagram of it sent at `sent_at`; True when a trial begins.
+        """Take a loss, the newest datagram of it sent at `sent_at`; return True if a trial begins.
 
-        `queued`: it may have met a queue, which is another's affair.
+        `queued`: it may have met a queue, which is handled elsewhere.
         """
         self._rtt_s = rtt_s
         trial = self._tried_share is not None
-        if trial or not queued:  # a loss that the lower rate did not prevent is one, whatever it met
+        if trial or not queued:  # a loss that the lower rate did not prevent counts, whatever it met
             self._fates.note(size, sent_at, lost=True)
             self._note_run(sent_at)
         if queued:
@@ -227,14 +227,14 @@ class Policer:
         return self._try(measured, sent_at, now)
 
     def on_spurious(self, size: int) -> None:
-        """Bytes taken for lost were only overtaken: a trial for their sake is over, and their end tells nothing."""
+        """Undo a supposed loss that was only overtaken: a trial because of it is void, and its end tells nothing."""
         self._fates.lost = max(0, self._fates.lost - size)
         if self._tried_share is not None:
             self._tried_share = None
             self._token_rate = self._before
 
     def end_round(self, now: float) -> None:
-        """A round trip is over."""
+        """End a round trip."""
         elapsed, self._round_at = now - self._round_at, now
         dry, self._dry = self._dry, False
         if not self._token_rate:
@@ -245,7 +245,7 @@ class Policer:
         elif self._overrun_at is not None:
             if now - self._overrun_at > self._unit_s:
                 if any(train > self._overrun_at for train in self._trains):
-                    self._set(self._token_rate, now, now)  # not enough was asked for to measure more
+                    self._set(self._token_rate, now, now)  # not enough was sent to measure more
                 else:
                     self._overrun_at = None  # nothing more was lost
         elif not dry:
@@ -269,7 +269,7 @@ class Policer:
         return fates.lost >= SUSPECT_BYTES and fates.share >= least and self._go_on()
 
     def _go_on(self) -> bool:
-        """Whether losses are not of one moment."""
+        """Return whether the losses are spread over more than one moment."""
         runs = self._runs
         return len(runs) == SUSPECT_RUNS and runs[-1] - runs[0] <= max(RUNS_S, RUNS_ROUNDS * self._rtt_s)
 
@@ -297,7 +297,7 @@ class Policer:
         return True
 
     def _give_up(self, now: float) -> None:
-        """The losses are not a policer's: they go on, whatever the rate."""
+        """Reject the policer: the losses go on, whatever the rate."""
         self._random, self._rejected_at = self._fates.share, now
         self._try_again_s = min(2 * self._try_again_s, MAX_TRY_AGAIN_S)
         self._token_rate = 0.0
@@ -309,7 +309,7 @@ class Policer:
         share = self._fates.share
         self._fates = _Fates(now)
         if share >= RANDOM * tried_share and (not self._before or self.burst <= SMALL_BURST):
-            # As much as before a policer was thought to be found: then that was chance.
+            # As much as before the trial that found the policer: that one was chance.
             self._token_rate = 0.0 if share >= RANDOM * self._found_share else self._before
             self._random, self._rejected_at = max(tried_share, share), now
             self._tried_share = None
@@ -327,7 +327,7 @@ class Policer:
             self.was_found = True
 
     def _on_overrun(self, sent_at: float, now: float) -> None:
-        """Take a loss above the rate: the bucket is empty. Stay at this rate until the next loss gives that of now."""
+        """Take a loss above the rate: the bucket is empty. Keep this rate until the next loss gives the current one."""
         fates = self._fates
         if self._overrun_at is None:
             if fates.lost > 2 * self._usual * fates.known + DATAGRAM_BYTES:
@@ -348,7 +348,7 @@ class Policer:
     # -- measuring ------------------------------------------------------------------------------------------------
 
     def _measure(self, sent_at: float, least: float = SPAN_BYTES) -> float | None:
-        """The rate of what left since the span began, as far as it arrived; None while that tells nothing."""
+        """Return the rate of what left since the span began, as far as it arrived; None if that tells nothing."""
         if self._span is None:
             return None
         at, before = self._span

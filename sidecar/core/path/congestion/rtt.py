@@ -1,4 +1,4 @@
-"""Round-trip time of one path (RFC 9002 section 5; RFC 6298)."""
+"""Estimates the round-trip time of one path (RFC 9002 section 5; RFC 6298)."""
 
 from __future__ import annotations
 
@@ -7,20 +7,20 @@ INITIAL_RTT_S = 0.2
 GRANULARITY_S = 0.001
 """Finest timer that is worth arming."""
 UNSTABLE_FLOOR_S = 0.060
-"""A path silent for less than this is never called unstable (SRT's floor)."""
+"""A path silent for less than this never counts as unstable (SRT's floor)."""
 LONGEST_WAIT_S = 1.0
-"""Beyond two bare round trips, nobody waits longer for a sign of life. A queue makes the round trip long, but what is
-in it still arrives one after the other; where nothing does for so long, the path is dead or as good as that. And what
-left before an outage and arrives after it makes a round trip that says nothing of the path."""
+"""Longest wait for a sign of life beyond two bare round trips. A queue makes the round trip long, but its datagrams
+still arrive one after the other; if none does for this long, the path is dead or as good as dead. What left before an
+outage and arrives after it makes a round trip that says nothing of the path."""
 LONGEST_ANSWER_S = 15.0
-"""Answers count for so long after what they answer left: longer than the longest round trip that has to work (10 s), by
-what both ends may add to it. Older ones would only say that the path lived once."""
+"""An answer counts for this long after its question left: longer than the longest round trip that has to work (10 s),
+by what both ends may add to it. Older ones would only say that the path lived once."""
 MINIMUM_MEMORY_S = 10.0
 """A minimum not seen again for this long is forgotten: the route may have become longer (BBR's RTprop filter)."""
 
 
 class RttEstimator:
-    """Smoothed round-trip time, its variation and its minimum of late, in seconds."""
+    """Smoothed round-trip time, its variation and its recent minimum, in seconds."""
 
     __slots__ = ("_half_began", "_half_minimum", "_last_minimum", "latest", "minimum", "smoothed", "variation")
 
@@ -28,7 +28,7 @@ class RttEstimator:
         self.smoothed = 0.0
         self.variation = 0.0
         self.minimum = 0.0
-        """The least of the last MINIMUM_MEMORY_S, give or take half."""
+        """The minimum of the last MINIMUM_MEMORY_S, give or take half."""
         self.latest = 0.0
         self._half_began = 0.0
         self._half_minimum = 0.0
@@ -40,9 +40,9 @@ class RttEstimator:
         return self.latest > 0
 
     def sample(self, rtt_s: float, now: float, peer_delay_s: float = 0.0) -> None:
-        """Take one measured round trip, of which the peer says that `peer_delay_s` is its own.
+        """Take one measured round trip, of which the peer claims `peer_delay_s` as its own delay.
 
-        The peer is believed only as far as its word leaves a possible round trip (RFC 9002 section 5.3).
+        The claim counts only if it leaves a possible round trip (RFC 9002 section 5.3).
         """
         rtt_s = max(rtt_s, 1e-6)
         if not self.has_sample:
@@ -58,7 +58,7 @@ class RttEstimator:
         self.latest = rtt_s
 
     def _note_minimum(self, rtt_s: float, now: float) -> None:
-        """Keep the least of this half of the memory and of the half before."""
+        """Keep the minimum of this half of the memory and of the previous half."""
         if now - self._half_began >= MINIMUM_MEMORY_S / 2:
             stale = now - self._half_began >= MINIMUM_MEMORY_S
             self._last_minimum = rtt_s if stale else self._half_minimum
@@ -69,31 +69,31 @@ class RttEstimator:
         self.minimum = min(self._half_minimum, self._last_minimum)
 
     def restart_minimum(self, minimum_s: float, now: float) -> None:
-        """Forget what the minimum was: this is what the path's round trip takes now, without a queue of ours."""
+        """Replace the minimum by the path's current round trip without a queue of ours."""
         self.minimum = self._half_minimum = self._last_minimum = minimum_s
         self._half_began = now
 
     def probe_timeout(self, peer_delay_s: float) -> float:
-        """Seconds after which an acknowledgement is overdue (RFC 9002 section 6.2.1)."""
+        """Return the seconds after which an acknowledgement is overdue (RFC 9002 section 6.2.1)."""
         if not self.has_sample:
             return 2 * INITIAL_RTT_S
         return self.smoothed + max(4 * self.variation, GRANULARITY_S) + peer_delay_s
 
     def loss_delay(self) -> float:
-        """Seconds after which a datagram older than an acknowledged one is lost (RFC 9002 section 6.1.2)."""
+        """Return the seconds after which a datagram older than an acknowledged one is lost (RFC 9002 section 6.1.2)."""
         reference = max(self.smoothed, self.latest) if self.has_sample else INITIAL_RTT_S
         return max(9 / 8 * reference, GRANULARITY_S)
 
     def silence_limit(self) -> float:
-        """Seconds of unanswered silence after which the path is unstable."""
+        """Return the seconds of unanswered silence after which the path is unstable."""
         if not self.has_sample:
             return 2 * INITIAL_RTT_S
         return max(min(2 * self.smoothed + 4 * self.variation, self.longest_wait()), UNSTABLE_FLOOR_S)
 
     def next_answer(self) -> float:
-        """Seconds within which the answer to what leaves now should come, if it takes little more than the last one."""
+        """Return in how many seconds the answer to what leaves now should come, if little slower than the last."""
         return self.latest + min(self.latest / 4, LONGEST_WAIT_S)
 
     def longest_wait(self) -> float:
-        """Seconds after which anything that is awaited of a living path should have come, whatever queue there is."""
+        """Return the seconds after which anything awaited on a living path should have come, whatever the queue."""
         return LONGEST_WAIT_S + 2 * min(self.minimum, LONGEST_WAIT_S)
