@@ -1,4 +1,4 @@
-"""One interface and its paths, owned by the interface's thread, without a lock.
+"""Runs one interface and its paths, which the interface's thread owns without a lock.
 
 Imports `path` and what that imports; nothing of the engine's half (ADR 4).
 """

@@ -1,4 +1,4 @@
-"""One interface's share of the data plane: datagrams in and out, all its paths. Owned by one thread; sans-IO.
+"""Runs one interface's share of the data plane: its datagrams and all its paths. Owned by one thread; sans-IO.
 
 The driver feeds `receive_batch`, `execute` and `handle_timer`, then drains `next_event` and `batches_to_send`.
 """
@@ -60,10 +60,10 @@ if TYPE_CHECKING:
     from sidecar.core.seam.links import LinkPeer
 
 MAX_FINISHED_DELAY_S = 0.003
-"""How long FINISHED of a small request waits for its answer, and the acknowledgement with it: less than
-MAX_ACK_DELAY_S, so that a busy host's lateness does not pass for a loss at the sender."""
+"""How long FINISHED of a small request, and the acknowledgement with it, waits for the answer. It is less than
+MAX_ACK_DELAY_S, so that a busy host's delay does not look like a loss to the sender."""
 MEASURE_EVERY_S = 0.25
-"""How often a path's round-trip times go to the engine."""
+"""Interval at which a path's round-trip times go to the engine."""
 
 
 class Link:
@@ -77,7 +77,7 @@ class Link:
         memory: LinkMemory | None = None,
         limits: KeyLimits = DEFAULT_LIMITS,
     ) -> None:
-        """`memory`: what the link that had this interface before, in the same session, left by `remember`."""
+        """Create the link; `memory` is what this interface's previous link, in the same session, left by `remember`."""
         self.identity = identity
         table = self._table = PathTable(identity, LinkMemory() if memory is None else memory, limits, rng)
         self.stats = table.stats
@@ -92,22 +92,23 @@ class Link:
         self._carrier = True
         self._timers: Timers[PathId] = Timers()
         self._unarmed: dict[PathId, Path] = {}
-        """What has sent since its timer was set: that waits until timers are asked for, the datagrams do not."""
+        """Paths that have sent since their timer was set. Setting it waits until timers are asked for; datagrams do not
+        wait."""
         self._stirred: dict[PathId, Path] = {}
-        """Paths of which there may be something to tell: a link with thousands that rest looks at these alone."""
+        """Paths that may have something to report: a link with thousands of idle ones looks at these alone."""
         self._measure_at = now + MEASURE_EVERY_S
 
     # -- what the driver calls ------------------------------------------------------------------------------------
 
     def receive_batch(self, data: memoryview, segment: int, source: Address, now: float) -> None:
-        """Take datagrams that came from `source` back to back, of `segment` bytes each; the last may be shorter.
+        """Take contiguous datagrams from `source`, of `segment` bytes each; the last may be shorter.
 
-        Fragments in the events view `data`: it must keep until the engine has had all events.
+        Fragments in the events view `data`: it must stay valid until the engine has had all events.
         """
         self._reader.receive_batch(data, segment, source, now)
 
     def execute(self, command: LinkCommand, now: float) -> None:
-        """Carry out what the engine asks."""
+        """Carry out a command of the engine."""
         match command:
             case Send(path_id, message):
                 path = self._live_path(path_id, message, range(message.symbols))
@@ -184,7 +185,7 @@ class Link:
         self._rearm()
         while (path_id := self._timers.pop_due(now)) is not None:
             path = self._paths.get((path_id.peer, path_id.remote))
-            if path is not None:  # an introduction may have taken the place of another
+            if path is not None:  # an introduction may have replaced this path
                 self._dirty[path_id] = path
                 self._keeper.on_timer(path, now)
         if self._stirred and now >= self._measure_at:
@@ -192,13 +193,13 @@ class Link:
             self._measure(now)
 
     def next_timer(self) -> float:
-        """When `handle_timer` is wanted next."""
+        """Return when `handle_timer` is wanted next."""
         self._rearm()
         timer = self._timers.next()
         return min(NEVER if timer is None else timer, self._measure_at if self._stirred else NEVER)
 
     def on_too_big(self, destination: Address, size: int, now: float) -> None:
-        """The kernel refused to send a datagram of this many bytes over the interface (EMSGSIZE)."""
+        """Note that the kernel refused to send a datagram of this many bytes over the interface (EMSGSIZE)."""
         for path in self._paths.values():
             if path.remote == destination:
                 self._mtu.too_big(path, size, now)
@@ -210,11 +211,11 @@ class Link:
 
     @property
     def pongs(self) -> deque[Pong]:
-        """What became of pings, the oldest first; the driver takes them out."""
+        """Results of pings, the oldest first; the driver takes them out."""
         return self._table.pings.done
 
     def path_ids(self) -> set[PathId]:
-        """Return all its paths; any thread may ask."""
+        """Return the ids of all paths; any thread may ask."""
         return {path.id for path in list(self._paths.values())}
 
     def paths_to(self, peer: str) -> list[PathId]:
@@ -222,29 +223,29 @@ class Link:
         return [path.id for (name, _), path in self._paths.copy().items() if name == peer]
 
     def views(self, now: float) -> Iterator[PathView]:
-        """Yield how each path is now. Any thread may ask: it reads what this link's thread writes.
+        """Yield the current view of each path. Any thread may ask: it reads what this link's thread writes.
 
-        Each view costs that thread nothing but its turn of the interpreter; who has many may pause between them.
+        Each view costs that thread nothing but its turn of the interpreter; a caller with many may pause between them.
         """
         for path in list(self._paths.values()):
             yield view_of(path, now)
 
     def living(self) -> list[PathId]:
-        """The paths that are not down."""
+        """Return the paths that are not down."""
         return [path.id for path in self._paths.values() if path.state is not PathState.DOWN]
 
     def note_source(self, path_id: PathId, source_towards: Callable[[Address], str | None]) -> None:
-        """Note from which address of ours the kernel sends to where the path leads now, as `source_towards` says."""
+        """Note the local address from which the kernel sends to the path's remote one, as `source_towards` says."""
         path = self._paths.get((path_id.peer, path_id.remote))
         if path is not None and path.remote is not None:
             path.source = source_towards(path.remote)
 
     def in_use(self, address: Address) -> bool:
-        """Whether a path that is not down leads to this address."""
+        """Return whether a path that is not down leads to this address."""
         return any(path.remote == address and path.state is not PathState.DOWN for path in self._paths.values())
 
     def batches_to_send(self, now: float) -> list[Batch]:
-        """Build what may leave now, at most about BURST_DATAGRAMS; call again until nothing comes."""
+        """Build what may leave now, at most about BURST_DATAGRAMS; call again until it returns nothing."""
         if not self._dirty:
             return []
         burst = Burst()
@@ -279,7 +280,7 @@ class Link:
     def _live_path(self, path_id: PathId, message: OutboundMessage, indices: Iterable[int]) -> Path | None:
         """Return the path if it can carry the message; otherwise hand the symbols back as lost.
 
-        The engine may know the path's state from before: it is told again, lest it send them here once more.
+        The engine may have an old state of the path: it is told again, so that it does not send them here once more.
         """
         path = self._paths.get((path_id.peer, path_id.remote))
         if path is None or path.state is PathState.DOWN:
@@ -323,13 +324,13 @@ class Link:
         )
 
     def remember(self, *, hangs: bool = False) -> LinkMemory:
-        """End the link; returns what the interface's next one must know. `hangs`: its driver may not have ended."""
+        """End the link; return what the interface's next one must know. `hangs`: its driver may not have ended."""
         return self._table.remember(hangs=hangs)
 
     # -- peers ----------------------------------------------------------------------------------------------------
 
     def _renew(self, credential: bytes, now: float) -> None:
-        """Introduce ourselves with this credential; to those as well to whom we talk: theirs may end before."""
+        """Introduce ourselves with this credential, to established peers too: the one they hold may end first."""
         if credential == self._builder.identity.credential:
             return
         self._builder.identity = replace(self.identity, credential=credential)

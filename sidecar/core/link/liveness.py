@@ -1,4 +1,4 @@
-"""Loss and liveness of one link's paths: what is lost goes back to the engine, which knows the other paths."""
+"""Detects loss and judges liveness on one link's paths; lost symbols go back to the engine, which knows other paths."""
 
 from __future__ import annotations
 
@@ -28,21 +28,21 @@ class PathKeeper:
         self._events = table.events
 
     def report_measured(self, path: Path) -> None:
-        """Tell the engine what was measured since the last time."""
+        """Report to the engine what was measured since the last report."""
         measured = path.take_measured()
         if measured is not None:
             self._events.append(measured)
 
     def on_ack(self, path: Path, ack: frame.AckFrame, now: float) -> None:
-        """An acknowledgement came over the path."""
+        """Process an acknowledgement that came over the path."""
         recovery = path.recovery
         newly = recovery.on_ack(ack, now)
         if newly is None:
             self._table.stats.dropped["acks_the_unsent"] += 1
             self._events.append(PeerLied(path.peer, path.session))
             return
-        # What was declared lost in haste proves life as well as what was not: where round trips grow faster than the
-        # timeouts, all of it is such. Each datagram counts once: what an acknowledgement repeats proves nothing.
+        # A datagram declared lost too early proves life as well as any other: where round trips grow faster than the
+        # timeouts, all of them are such. Each datagram counts once: a repeated acknowledgement proves nothing.
         if late := recovery.late(ack, now):
             path.control.policer.on_spurious(sum(run.size for run in late))
         arrived = newly + late
@@ -60,7 +60,7 @@ class PathKeeper:
         self._detect_lost(path, now)
 
     def probe_answered(self, path: Path, sent_at: float, now: float) -> None:
-        """A probe of liveness that left at `sent_at` (s) was answered."""
+        """Note that a probe of liveness that left at `sent_at` (s) was answered."""
         path.mtu.on_delivered(0)
         in_flight = path.recovery.sent
         if path.made_progress(now):
@@ -70,7 +70,7 @@ class PathKeeper:
             self.path_up(path, now)
 
     def keys_offered(self, path: Path, offer: frame.KeyOffer, now: float) -> None:
-        """The peer, who leads, offers new keys. Raises DecodeError."""
+        """Answer the offer of new keys from the peer, which leads. Raises DecodeError."""
         answer = path.answer_keys(offer, now)
         if answer is not None:
             # The same offer may have come twice by now, and a datagram holds one answer.
@@ -78,12 +78,12 @@ class PathKeeper:
             self._table.owe(path, encode_key_answer(answer))
 
     def keys_answered(self, path: Path, answer: frame.KeyAnswer, now: float) -> None:
-        """The peer answers our offer of new keys. Raises DecodeError."""
+        """Take the peer's answer to our offer of new keys. Raises DecodeError."""
         if path.take_keys(answer, now):
             self._answers(path, now)
 
     def follow_keys(self, path: Path, now: float) -> None:
-        """Something opened: go on with new keys, if it did with these."""
+        """Switch to the new keys if a datagram just opened with them."""
         if path.keys.follow(now):
             self._answers(path, now)
 
@@ -92,7 +92,7 @@ class PathKeeper:
             self.path_up(path, now)
 
     def path_up(self, path: Path, now: float) -> None:
-        """The path answers."""
+        """Note that the path answers and is up."""
         path.control.on_path_up(now)
         self.report_measured(path)  # before its first request, so that its round-trip time counts in the choice
         self._events.append(PathChanged(path.id, PathState.UP, "answers"))
@@ -120,7 +120,7 @@ class PathKeeper:
                 self._events.append(PathChanged(path.id, state, "silent"))
 
     def _lead_back(self, path: Path, now: float) -> None:
-        """Nobody answers where the newest datagrams came from."""
+        """Return to the last proven address: nobody answers at the newest datagrams' source."""
         before = path.address.before()
         if before is not None:
             self._table.stats.dropped["address_unproven"] += 1
@@ -137,26 +137,26 @@ class PathKeeper:
             self._lost(path, lost, now)
 
     def take_all_down(self, reason: str) -> None:
-        """As `take_down`, for every path."""
+        """Do as `take_down` for every path."""
         for path in self._table.paths.values():
             if path.state is not PathState.DOWN:
                 self.take_down(path, reason)
 
     def take_down(self, path: Path, reason: str) -> None:
-        """It is known that the path is of no use: what it was asked until now proves nothing, whenever it is answered.
+        """Take down a path known to be useless; answers to what it was asked before prove nothing, whenever they come.
 
-        So with an interface without carrier, a driver that hangs, a peer that says goodbye: what they left in a buffer
-        must not bring the path back. One that is down since it is silent comes back by any answer (see `on_timer`):
-        where that is late for a slow path, it is the only sign of life there can be. An answer opens with the keys of
-        this session, is taken once by its packet number, and fits one question of the last LONGEST_ANSWER_S. So who can
-        hold datagrams back, but not forge them, can make a path that died seem alive for so long at most.
+        That is so for an interface without carrier, a driver that hangs, or a peer that says goodbye: what they left in
+        a buffer must not bring the path back. A path that is down because of silence comes back by any answer (see
+        `on_timer`): on a slow path a late answer is the only possible sign of life. An answer opens with this session's
+        keys, is taken once by its packet number, and fits one question of the last LONGEST_ANSWER_S. So someone who can
+        hold datagrams back, but not forge them, can make a dead path seem alive for that long at most.
         """
         path.probing.forget()
         path.go_down()
         self._hand_back(path, reason, forget=True)
 
     def _hand_back(self, path: Path, reason: str, *, forget: bool) -> None:
-        """Say that the path is down, and hand back what it still carried."""
+        """Report the path down, and hand back what it still carried."""
         path.control.on_path_down()
         self._events.append(PathChanged(path.id, PathState.DOWN, reason))
         self._report_lost(path, path.recovery.give_up_all(forget=forget))
@@ -167,7 +167,7 @@ class PathKeeper:
             self._events.append(FragmentsLost(path.id, message, indices))
 
     def rebind(self, path: Path, now: float) -> None:
-        """What is under way left from where we no longer are, or its answers go there: it travels again elsewhere."""
+        """Send what is in flight again elsewhere: it left from an address we lost, or its answers go there."""
         was_up = path.state is PathState.UP
         self._mtu.start_afresh(path)
         path.start_afresh(now)

@@ -1,9 +1,9 @@
-"""What an interface's link knows of paths that are no more: their keys' phases, and the packet numbers that came.
+"""Keeps what an interface's link knows of past paths: their keys' phases, and the packet numbers that came.
 
-A session may come back after minutes or hours with the same keys, so what came once must never count as new
-(replayed requests would run again) and a key's phase must not begin anew (the peer would not be understood). Each peer
-has a share, so none can flush what is known of another. Where a share is full the oldest session of that peer goes,
-and from then on its sessions up to that one are refused: nothing of a forgotten session begins anew.
+A session may come back after minutes or hours with the same keys. So a packet number that came once must never count as
+new (replayed requests would run again), and a key's phase must not restart (the peer would not be understood). Each
+peer has a share, so none can flush what is known of another. When a share is full, that peer's oldest session goes.
+From then on its sessions up to that one are refused: no forgotten session restarts.
 """
 
 from __future__ import annotations
@@ -16,16 +16,16 @@ if TYPE_CHECKING:
     from sidecar.core.path.keys import PathKeys
 
 MAX_PATHS_OF_A_PEER = 256
-"""As many as one session can have to one of our interfaces: an interface's number has 8 bits. So a share never forgets
-the session in use."""
+"""As many as one session can have to one of our interfaces, since an interface's number has 8 bits. So a share never
+forgets the current session."""
 MAX_PATHS = 16_384
-"""Beyond it, whoever has the most forgets the oldest session's."""
+"""Beyond it, the peer with the most paths loses its oldest session's."""
 MAX_FORGOTTEN_PEERS = 65_536
-"""Peers of which a session was forgotten."""
+"""Peers remembered as having a forgotten session."""
 
 
 class LinkMemory:
-    """What an interface's next link, in the same run of the sidecar, must know of the one before."""
+    """What an interface's next link, in the same run of the sidecar, must know of the previous one."""
 
     __slots__ = ("_count", "_eras", "_forgotten", "_paths", "next_number")
 
@@ -42,7 +42,7 @@ class LinkMemory:
         return self._count
 
     def keep_all(self, other: LinkMemory) -> None:
-        """Take over what another one keeps."""
+        """Take over what another memory keeps."""
         for peer, era in list(other._eras.items()):
             self.begin_era(peer, era)
         for peer, incarnation in list(other._forgotten.items()):
@@ -52,9 +52,9 @@ class LinkMemory:
                 self.keep(peer, session, remote, keys.copy())
 
     def begin_era(self, peer: NodeName, era: int) -> None:
-        """What is known of a peer is of one that was revoked, if its era is another one.
+        """Discard what is known of a peer if its era changed: that peer was revoked.
 
-        That one may have used the largest incarnations there are, and none of its sessions can come back.
+        It may have used the largest incarnations there are, and none of its sessions can come back.
         """
         if era == self._eras.get(peer, 0):
             return
@@ -63,11 +63,11 @@ class LinkMemory:
         self._forgotten.pop(peer, None)
 
     def keep(self, peer: NodeName, session: SessionId, remote: InterfaceId, keys: PathKeys) -> None:
-        """The path with these keys, to this interface of a peer's session, is no more."""
+        """Keep the keys of a past path to this interface of a peer's session."""
         keys.opening.forget_previous()
         if keys.received.largest < 0 and not keys.has_answered:
-            # Nothing of the peer was ever opened, so its window is empty, and both ends' keys are those of the
-            # beginning. Who introduces interfaces that do not exist, without its session's key, leaves nothing here.
+            # Nothing of the peer was ever opened, so its window is empty, and both ends have their initial keys. A
+            # member that introduces interfaces that do not exist, without its session's key, leaves nothing here.
             return
         paths = self._paths.setdefault(peer, {})
         self._count += (session, remote) not in paths
@@ -78,7 +78,7 @@ class LinkMemory:
             self._evict(max(self._paths, key=lambda name: len(self._paths[name])))
 
     def take(self, peer: NodeName, session: SessionId, remote: InterfaceId) -> PathKeys | None:
-        """Return what was kept of a path that is there again."""
+        """Remove and return what was kept of a path that is back."""
         paths = self._paths.get(peer, {})
         keys = paths.pop((session, remote), None)
         if keys is not None:
@@ -88,7 +88,7 @@ class LinkMemory:
         return keys
 
     def forgot(self, peer: NodeName, incarnation: int) -> bool:
-        """Whether a path of this session that is not kept may be forgotten: then it must not begin anew."""
+        """Return whether an unknown path of this session may be a forgotten one, which must not restart."""
         return incarnation <= self._forgotten.get(peer, -1)
 
     def _evict(self, peer: NodeName) -> None:

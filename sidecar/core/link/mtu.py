@@ -1,4 +1,4 @@
-"""What one link does about the MTU of its paths: starts the search, tells the engine, hands back what is too long."""
+"""Handles path MTU for one link: starts the search, informs the engine, hands back what is too long."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ if TYPE_CHECKING:
     from sidecar.core.seam.links import LinkEvent
 
 DEFAULT_MTU = 1500
-"""Ethernet's, in bytes; until the interface's own is known."""
+"""Ethernet's MTU in bytes, used until the interface's own is known."""
 
 
 class LinkMtu:
-    """The MTU of one interface, and what follows from it for the link's paths."""
+    """The MTU of one interface, and its effect on the link's paths."""
 
     __slots__ = ("_events", "_mtu")
 
@@ -32,24 +32,24 @@ class LinkMtu:
         self._mtu = DEFAULT_MTU
 
     def set_interface(self, mtu: int, paths: Iterable[Path], now: float) -> None:
-        """The interface takes packets of this many bytes, IP header included."""
+        """Set the interface's MTU in bytes, IP header included."""
         self._mtu = mtu
         for path in paths:
             if path.state is not PathState.DOWN:
                 self.search(path, now)
 
     def search(self, path: Path, now: float) -> None:
-        """The path is up: look for the longest datagram that it carries."""
+        """Look for the longest datagram that a path, which is up, carries."""
         if path.remote is not None and path.mtu.start(payloads(self._mtu, ipv6=":" in path.remote[0]), now):
             self._fell(path)
 
     def start_afresh(self, path: Path) -> None:
-        """Nothing is known of the path any more; the search begins when it is up."""
+        """Forget the path's size; the search begins when it is up."""
         if path.mtu.stop():
             self._fell(path)
 
     def moved(self, path: Path, source: Address, now: float) -> None:
-        """The peer's datagrams come from elsewhere: another route, unless only a NAT gave it another port."""
+        """Note that the peer's datagrams come from elsewhere: by another route, unless only a NAT changed its port."""
         elsewhere = path.remote is not None and source[0] != path.remote[0]
         path.address.move(source, now)
         if elsewhere:
@@ -59,7 +59,7 @@ class LinkMtu:
             self.search(path, now)
 
     def answered(self, path: Path, probe_id: int, now: float) -> bool:
-        """A PROBE_REPLY came; False when it answers no probe of the size."""
+        """Take a PROBE_REPLY; return False if it answers no MTU probe."""
         before = path.mtu.size
         answers = path.mtu.on_reply(probe_id, now)
         if path.mtu.size != before:
@@ -67,19 +67,19 @@ class LinkMtu:
         return answers
 
     def lost(self, path: Path, lost: list[Sent], now: float) -> None:
-        """These datagrams were found lost at once; call it before they are sent again."""
-        # Those that are longer than what is sent now left before it fell, and say nothing of what is sent now.
+        """Note datagrams that were found lost at once; call it before they are sent again."""
+        # Those longer than the current size left before it fell, and say nothing of what is sent now.
         large = sum(run.within(BASE_BYTES + 1, path.mtu.size) for run in lost)
         if large and path.mtu.on_lost(large, now):
             self._fell(path)
 
     def too_big(self, path: Path, size: int, now: float) -> None:
-        """The kernel refused to send a datagram of this many bytes over the interface."""
+        """Note that the kernel refused to send a datagram of this many bytes over the interface."""
         if path.mtu.on_too_big(size, now):
             self._fell(path)
 
     def _fell(self, path: Path) -> None:
-        """Hand back what waits in datagrams that the path does not carry any more; what is on its way gets lost."""
+        """Hand back what waits in datagrams too long for the path; those in flight get lost."""
         self._events.append(PathMtuChanged(path.id, path.mtu.size))
         for message, indices in path.queue.clear():
             if message.datagram_bytes <= path.mtu.size:

@@ -1,4 +1,4 @@
-"""The paths of one link, by what their datagrams say and by what the engine says; shared by the link's parts."""
+"""Finds one link's paths by what their datagrams say and by what the engine says; the link's parts share it."""
 
 from __future__ import annotations
 
@@ -26,29 +26,30 @@ if TYPE_CHECKING:
     from sidecar.core.seam.links import LinkEvent, LinkPeer
 
 MAX_PENDING_FRAMES = 256
-"""Control frames waiting on one path besides FINISHED; a peer that makes us owe more is not honest."""
+"""Control frames waiting on one path besides FINISHED; only a dishonest peer makes us owe more."""
 MAX_PENDING_FINISHED = 8192
 """FINISHED waiting on one path: as many as an honest peer has undelivered messages to us (`room.py`)."""
 MAX_PATHS_OF_A_PEER = 32
-"""Those that a peer introduces itself by included. A further introduction takes the place of one that nothing
-authentic followed; if there is none, it waits for the control plane's word."""
+"""Paths of one peer, including those by which it introduces itself. A further introduction replaces a path that nothing
+authentic followed; if there is none, it waits until the control plane names that path."""
 NEW_PATHS = 64
-"""Paths that one peer may begin by introductions at once: all that it may have, and all of them again, ..."""
+"""Burst of paths that one peer may begin by introductions: all that it may have, and all of them again, ..."""
 NEW_PATHS_PER_S = 8.0
-"""... and so many a second after that, as if it were restarted each second with 8 interfaces. Each costs public-key
-work, some 0.3 ms: without this a member that goes on to another interface with each introduction takes a processor."""
+"""... and their rate after that, as if it restarted each second with 8 interfaces. Each costs public-key work, some 0.3
+ms: without this a member that introduces ever new interfaces would occupy a processor."""
 HANGING_LINK_NUMBERS = 1 << 32
-"""Packet numbers left to a link whose driver does not return, lest its next one seals with the same."""
+"""Packet numbers reserved for a link whose driver does not return, so that the next link never seals with the same."""
 UNPROVEN_BYTES = 65_536
-"""What may go to all addresses together at which a peer has never proven to be: some 60 introductions, ..."""
+"""Burst that may go to all addresses together that a peer has never proven: some 60 introductions, ..."""
 UNPROVEN_BYTES_PER_S = 1200.0
-"""... and one a second after that. Whoever announces or lists addresses of others gets no more out of each link."""
+"""... and the rate after that: one introduction a second. Announcing or listing others' addresses gets no more than
+this out of each link."""
 MAX_INTRODUCTIONS = 4
 """Introductions on one path that wait for their answer; an honest peer repeats its own."""
 
 
 class PathTable:
-    """Paths, who may use them, and what came of them."""
+    """Paths, who may use them, and their events and counters."""
 
     __slots__ = (
         "_by_peer", "_exchanges", "_limits", "_memory", "_new_paths", "_rng", "_unproven", "by_hello", "by_session",
@@ -60,11 +61,11 @@ class PathTable:
         self._limits = limits
         self._rng = rng
         self._unproven: dict[NodeName, TokenBucket] = {}
-        """What may go to addresses of each peer at which it has never proven to be, in bytes."""
+        """Bytes that may go to addresses that each peer has never proven."""
         self._new_paths: dict[NodeName, TokenBucket] = {}
-        """How many paths each peer may begin by introductions."""
+        """Paths that each peer may begin by introductions."""
         self._exchanges: dict[NodeName, TokenBucket] = {}
-        """How many exchanges of keys with each peer are worked on."""
+        """Key exchanges with each peer that are processed."""
         self.identity = identity
         self.stats = LinkStats(identity.interface)
         self.events: deque[LinkEvent] = deque()
@@ -74,17 +75,17 @@ class PathTable:
         self.paths: dict[tuple[NodeName, InterfaceId], Path] = {}
         self._by_peer: dict[NodeName, list[Path]] = {}
         self.dirty: dict[PathId, Path] = {}
-        """Paths that may have something to send, or another timer than before."""
+        """Paths that may have something to send, or a changed timer."""
         self.pings = Pings()
         self.closing = False
 
     @property
     def next_number(self) -> int:
-        """No path of this link used this packet number or a later one."""
+        """A packet number that no path of this link has reached yet."""
         return max((self._memory.next_number, *(path.recovery.next_number for path in list(self.paths.values()))))
 
     def remember(self, *, hangs: bool) -> LinkMemory:
-        """Return what the interface's next link must know; `hangs`: this one may yet seal a burst or two."""
+        """Return what the interface's next link must know; `hangs`: this link may yet seal a burst or two."""
         memory = LinkMemory(self.next_number + (HANGING_LINK_NUMBERS if hangs else 0))
         memory.keep_all(self._memory)
         for path in list(self.paths.values()):
@@ -92,9 +93,9 @@ class PathTable:
         return memory
 
     def introduced(self, peer: LinkPeer, remote: InterfaceId, now: float) -> Path | None:
-        """Return the path to the interface by which a known peer introduced itself; None when it has too many.
+        """Return the path to the interface by which a known peer introduced itself; None if it has too many.
 
-        The control plane need not have told of it: so a robot's new interface works before, and without, it.
+        The control plane may not know that interface: so a robot's new interface works before it does, and without it.
         """
         path = self.paths.get((peer.name, remote))
         if path is not None:
@@ -104,7 +105,7 @@ class PathTable:
             return None
         others = self.to(peer.name)
         if len(others) >= MAX_PATHS_OF_A_PEER:
-            # The peer, or whoever stole its token for us, could fill the table with interfaces that do not exist.
+            # The peer, or a thief of its token for us, could fill the table with interfaces that do not exist.
             unproven = next((path for path in others if path.remote is None and not path.candidates), None)
             if unproven is None:
                 self.stats.dropped["paths_full"] += 1
@@ -122,11 +123,11 @@ class PathTable:
         return bucket.take(now)
 
     def to(self, peer: NodeName) -> Sequence[Path]:
-        """The paths to one peer."""
+        """Return the paths to one peer."""
         return self._by_peer.get(peer, ())
 
     def is_home(self, peer: NodeName, source: Address) -> bool:
-        """Whether the peer is known to be at this address."""
+        """Return whether the peer is known to be at this address."""
         return any(source == path.remote or source in path.candidates for path in self.to(peer))
 
     def _enter(self, path: Path) -> None:
@@ -136,7 +137,7 @@ class PathTable:
     def _new_path(
         self, peer: LinkPeer, remote: InterfaceId, addresses: tuple[Address, ...], first_number: int, now: float
     ) -> Path | None:
-        """None for a path of a session that this link has forgotten: what came over it once would count as new."""
+        """Return None for a forgotten session's path: what came over it once would count as new."""
         leads = self.identity.role is Role.ROBOT
         keys = self._memory.take(peer.name, peer.session, remote)
         if keys is None:
@@ -154,7 +155,7 @@ class PathTable:
         return Path(path_id, peer.session, keys, addresses, first_number, now, self._rng, *budgets, leads=leads)
 
     def way_changed(self, now: float) -> None:
-        """Our own side of all paths is another: peers that could not be reached may be now."""
+        """Refill the budgets, since our side of all paths changed: unreachable peers may be reachable now."""
         for bucket in self._unproven.values():
             bucket.fill(now)
 
@@ -165,12 +166,12 @@ class PathTable:
         self._forget(path)
 
     def _forget(self, path: Path) -> None:
-        # It may come back with the same keys: no number that it sealed with may be used again.
+        # It may come back with the same keys: no number that it sealed with may be reused.
         self._memory.next_number = max(self._memory.next_number, path.recovery.next_number)
         self._memory.keep(path.peer, path.session, path.remote_id, path.keys)
 
     def owe(self, path: Path, encoded: bytes, by: float = 0.0) -> None:
-        """Queue an encoded control frame for the path's next datagram, which leaves at `by` (s) at the latest."""
+        """Queue an encoded control frame for the path's next datagram, which leaves by `by` (s)."""
         if len(path.pending) >= MAX_PENDING_FRAMES:
             self.stats.dropped["pending_frames_full"] += 1
             return
@@ -179,7 +180,7 @@ class PathTable:
         self.dirty[path.id] = path
 
     def owe_finished(self, path: Path, number: int, by: float = 0.0) -> None:
-        """As `owe`: the peer's message with this number is whole."""
+        """Queue FINISHED for the peer's message with this number, as `owe` does."""
         # A sender that hears nothing asks again (`Outbox.ask_again`).
         if len(path.finished) >= MAX_PENDING_FINISHED and number not in path.finished:
             self.stats.dropped["pending_frames_full"] += 1
@@ -189,9 +190,9 @@ class PathTable:
         self.dirty[path.id] = path
 
     def set_peers(self, peers: tuple[LinkPeer, ...], now: float) -> list[Path]:
-        """Keep the paths to these peers and begin new ones; returns those that are no more."""
+        """Keep the paths to these peers and begin new ones; return those that ended."""
         before = self.paths.copy()
-        # A peer that comes back may remember our old packet numbers under the same session: never use one again.
+        # A peer that comes back may remember our old packet numbers under the same session: never reuse one.
         first_number = self._memory.next_number = self.next_number
         self.by_session = {peer.session: peer for peer in peers}
         self.by_hello = {hello_id(peer.token): peer for peer in peers}
@@ -216,13 +217,13 @@ class PathTable:
         for key, path in list(before.items()):
             known = self.by_session.get(path.session)
             if path.state is not PathState.DOWN and known is not None and key not in self.paths:
-                # It proves itself, whatever the control plane's view says: older or newer than what happened here.
+                # It proves itself, whether the control plane's view is older or newer than what happened here.
                 self._enter(before.pop(key))
         for path in before.values():
             self._forget(path)
         names = {peer.name for peer in peers}
         for buckets in (self._unproven, self._exchanges, self._new_paths):
-            # Who leaves and comes back, as often as it likes, has what was left: only full ones are forgotten.
+            # A peer that leaves and returns at will keeps what was left: only full ones are forgotten.
             for name in [name for name, one in buckets.items() if name not in names and one.is_full(now)]:
                 del buckets[name]
         return list(before.values())

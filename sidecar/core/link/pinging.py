@@ -1,8 +1,8 @@
-"""Pings of one link: probes that somebody on this host asked for, to see how long a path takes.
+"""Runs the pings of one link: probes that somebody on this host asked for, to see how long a path takes.
 
-A ping is a PROBE, padded to the size that was asked for, so that a peer of any version answers it. Its answer is told
-to who asked and to nobody else: it is no sample of the round-trip time, proves no life and plans no probe, so that what
-a curious user does changes nothing of what the path is believed to be. The budget is the link's, not the user's.
+A ping is a PROBE, padded to the requested size, so a peer of any version answers it. Its answer goes to the one who
+asked and to nobody else: it is no sample of the round-trip time, proves no life and plans no probe. So a curious user
+changes nothing of what the path is believed to be. The budget is the link's, not the user's.
 """
 
 from __future__ import annotations
@@ -24,32 +24,32 @@ if TYPE_CHECKING:
     from sidecar.core.seam.links import Ping
 
 PINGS_PER_S = 20.0
-"""Of one link, however many ask: some 30 kB a second of the longest that Ethernet carries, ..."""
+"""Rate of one link, however many ask: some 30 kB a second of the longest that Ethernet carries, ..."""
 PINGS_AT_ONCE = 40.0
-"""... and so many at once."""
+"""... and its burst."""
 COST_BYTES = 1500
-"""A longer one counts as several."""
+"""A longer ping counts as several."""
 MAX_PINGS_OUT = 64
 """Unanswered pings of one link that are remembered; the oldest goes first."""
 LEAST_BYTES = HEADER_BYTES + 9 + TAG_BYTES
-"""A PROBE without padding: 45 bytes of UDP payload."""
+"""Size of a PROBE without padding: 45 bytes of UDP payload."""
 
 
 @dataclass(frozen=True, slots=True)
 class Pong:
-    """What became of a ping."""
+    """Result of a ping."""
 
     number: int
-    """Of the ping."""
+    """Number of the ping."""
     path: PathId
     rtt_s: float = 0.0
     """From the datagram that left to the one that came, in seconds; 0 with a problem."""
     problem: str = ""
-    """Why it was not sent; empty: it was answered."""
+    """Why it was not sent; empty if it was answered."""
 
 
 class Pings:
-    """Which pings are out, and what became of them."""
+    """Outstanding pings, and results."""
 
     __slots__ = ("_budget", "_out", "done")
 
@@ -57,10 +57,10 @@ class Pings:
         self._budget: TokenBucket | None = None
         self._out: dict[int, SentPing] = {}
         self.done: deque[Pong] = deque()
-        """For the driver, oldest first: one for each ping at most."""
+        """For the driver, oldest first; at most one for each ping."""
 
     def ask(self, path: Path | None, ping: Ping, now: float) -> bool:
-        """Take a ping; whether it leaves over `path` (None: there is no such path)."""
+        """Take a ping; return whether it leaves over `path` (None: there is no such path)."""
         problem = "there is no such path" if path is None else self._problem(path, ping, now)
         if problem or path is None:
             self.done.append(Pong(ping.number, ping.path, problem=problem))
@@ -92,7 +92,7 @@ class Pings:
             del self._out[oldest.id]
 
     def answered(self, path: Path, probe_id: int, now: float) -> bool:
-        """A PROBE_REPLY came over `path`; False when it answers no ping."""
+        """Take a PROBE_REPLY that came over `path`; return False if it answers no ping."""
         sent = self._out.get(probe_id)
         if sent is None or sent.path != path.id or sent.sent_at is None:
             return False

@@ -1,7 +1,7 @@
 """Opens and reads the datagrams that one link receives.
 
 The opener finds out whose a datagram is and whether it is authentic; everything else ends in a counter. The reader acts
-on the frames of authentic datagrams, in the order of their arrival; wrong ones end in a counter too.
+on the frames of authentic datagrams, in order of arrival; wrong ones end in a counter too.
 """
 
 from __future__ import annotations
@@ -63,7 +63,7 @@ Opened = tuple["Path", int, memoryview]
 
 
 class LinkOpener:
-    """Knows whose a datagram is, and whether it is."""
+    """Finds whose a datagram is, and whether it is authentic."""
 
     __slots__ = ("_dropped", "_table")
 
@@ -72,12 +72,12 @@ class LinkOpener:
         self._dropped = table.stats.dropped
 
     def open_batch(self, data: memoryview, segment: int, source: Address, now: float) -> list[Opened]:
-        """Open datagrams that lie back to back, of `segment` bytes each; the last may be shorter.
+        """Open contiguous datagrams of `segment` bytes each; the last may be shorter.
 
-        What is opened lies in one new buffer for all of them. Introductions are dealt with here.
+        Their frames lie in one new buffer. Introductions are handled here.
         """
         opened: list[Opened] = []
-        # Opened in place, a datagram that fails the keys of one phase would be lost to those of another.
+        # Decryption in place would lose a datagram that fails one phase's keys to those of another.
         plain = memoryview(bytearray(len(data)))
         unpack, dropped = CLEAR.unpack_from, self._dropped
         path: Path | None = None
@@ -117,14 +117,14 @@ class LinkOpener:
         return opened
 
     def _leave_out(self, opened: list[Opened], path: Path) -> None:
-        """A path's first fresh keys came into use: what was opened before is not to be read as if sealed with these."""
+        """Drop what was opened before a path's first fresh keys: it must not be read as if sealed with them."""
         fresh = [one for one in opened if one[0] is not path]
         if len(fresh) < len(opened):
             self._dropped["before_fresh_keys"] += len(opened) - len(fresh)
             opened[:] = fresh
 
     def _path_of(self, head: int, session: int) -> Path | None:
-        """Return the path that datagrams of this clear head (the first four bytes) and session come over."""
+        """Return the path of datagrams with this clear head (the first four bytes) and session."""
         peer = self._table.by_session.get(SessionId(session))
         if peer is None:
             return None
@@ -134,7 +134,7 @@ class LinkOpener:
         return path
 
     def _refuse(self, datagram: memoryview, source: Address, now: float) -> None:
-        """Take an introduction; count anything else, which is of no path."""
+        """Take an introduction; count anything else, which belongs to no path."""
         try:
             header = frame.decode_header(datagram)
             reason = self._reason(header, datagram, source, now)
@@ -162,7 +162,7 @@ class LinkOpener:
         return "malformed"  # too short for a frame
 
     def _introduction(self, header: Header, datagram: memoryview, source: Address, now: float) -> str | None:
-        """Note what an introduction asks for; returns why it is dropped, or None."""
+        """Note what an introduction asks for; return why it is dropped, or None."""
         table = self._table
         peer = table.by_hello.get(read_hello_id(datagram))
         if peer is None:
@@ -188,7 +188,7 @@ class LinkOpener:
             return "duplicate"
         keys.introduced = max(keys.introduced, number)
         if table.closing:
-            return None  # an answer would bring us back to life over there
+            return None  # an answer would bring us back to life at the peer
         if len(path.introductions) >= MAX_INTRODUCTIONS:
             return "introductions_full"
         try:
@@ -211,11 +211,11 @@ class LinkOpener:
 T = TypeVar("T")
 
 DATAGRAM_BYTES = HEADER_BYTES + TAG_BYTES
-"""Of a datagram beside its frames."""
+"""Bytes of a datagram besides its frames."""
 
 
 _BEFORE_FRESH_KEYS = (frame.Probe, frame.ProbeReply, frame.KeyOffer, frame.KeyAnswer)
-"""What a path carries before the first exchange of keys: see `key_exchange`."""
+"""What a path carries before the first key exchange: see `key_exchange`."""
 
 
 class LinkReader:
@@ -231,8 +231,8 @@ class LinkReader:
         self._events = table.events
         self._stats = table.stats
         self._leads = table.identity.role is Role.ROBOT
-        """Whether this end says which of both ends' addresses a path uses. If each went where the other's newest
-        datagram came from, two that have several addresses each could follow each other in turns for ever."""
+        """Whether this end decides which of both ends' addresses a path uses. If each end followed the other's newest
+        datagram, two ends with several addresses each could follow each other in turns forever."""
 
     def receive_batch(self, data: memoryview, segment: int, source: Address, now: float) -> None:
         """See `Link.receive_batch`."""
@@ -248,9 +248,10 @@ class LinkReader:
                 position += 1
 
     def _receive_fragments(self, opened: list[Opened], position: int, source: Address, now: float) -> int:
-        """Take the datagrams from `position` on that hold one FRAGMENT or REPAIR and nothing else, as long as they are
-        of one path and come in order; returns the position of the first that is not. Nearly all datagrams of a long
-        message are such. What looks odd is left to `_receive_datagram`.
+        """Take consecutive datagrams from `position` on that each hold a single FRAGMENT or REPAIR.
+
+        They must be of one path and in order; returns the position of the first that is not. Nearly all datagrams of a
+        long message are such. Anything odd is left to `_receive_datagram`.
         """
         path, low, _ = opened[position]
         received = path.received
@@ -297,7 +298,7 @@ class LinkReader:
         return position + len(fragments)
 
     def _heard(self, path: Path, source: Address, now: float, *, newest: bool) -> None:
-        """An authentic datagram that is no duplicate came; `newest`: sent after all that came before."""
+        """Note an authentic datagram that is no duplicate; `newest`: sent after all that came before."""
         if newest and source != path.remote and not (self._leads and path.keeps_address(source)):
             self._mtu.moved(path, source, now)
         self._keeper.follow_keys(path, now)
@@ -305,20 +306,20 @@ class LinkReader:
 
     @staticmethod
     def _unproven(path: Path, source: Address, size: int, now: float) -> None:
-        """So many bytes came over a path that leads to where the peer has not proven to be: ask whether it is there."""
+        """Note bytes over a path to an unproven address, and ask whether the peer is there."""
         path.address.came(source, size)
         if path.state is not PathState.DOWN:
             path.probing.challenge(now)
 
     @staticmethod
     def _used(path: Path, now: float) -> None:
-        """The peer sends what it would not send over a path that is down to it."""
+        """Note that the peer sends what it would not send over a path that is down to it."""
         if path.state is PathState.DOWN:
             path.hasten_probe(now)
         path.probing.used(now)
 
     def _hand_up(self, path: Path, fragments: list[Fragment]) -> None:
-        """Append to the event before, if it is of the same path and session."""
+        """Append to the previous event, if it is of the same path and session."""
         before = self._events[-1] if self._events else None
         if isinstance(before, FragmentsReceived) and before.path is path.id and before.session == path.session:
             before.fragments.extend(fragments)
@@ -358,7 +359,7 @@ class LinkReader:
                 case frame.AckFrame():
                     self._keeper.on_ack(path, item, now)
                 case frame.Probe(probe_id) if self._table.closing:
-                    pass  # an answer would bring us back to life over there
+                    pass  # an answer would bring us back to life at the peer
                 case frame.Probe(probe_id):
                     path.asked(now)
                     self._table.owe(path, frame.encode_probe_reply(frame.ProbeReply(probe_id)))
@@ -383,8 +384,8 @@ class LinkReader:
                     self._exchange(self._keeper.keys_answered, path, item, now)
         self._stats.datagrams["received", kind] += 1
         if path.state is PathState.DOWN and not replies:
-            # It lives in this direction. A reply that fits nothing says only that it is slow: were it a reason to ask,
-            # each one would call for the next.
+            # It lives in this direction. A reply that fits nothing says only that it is slow: if that were a reason to
+            # ask, each one would call for the next.
             path.hasten_probe(now)
         if eliciting:
             path.received.owe_ack(now)

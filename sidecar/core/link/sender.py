@@ -1,4 +1,4 @@
-"""Builds one interface's datagrams: what a path owes, its probes, its queue of symbols."""
+"""Builds one interface's datagrams from what its paths owe, their probes and their queued symbols."""
 
 from __future__ import annotations
 
@@ -39,20 +39,21 @@ BURST_DATAGRAMS = 64
 """Datagrams built in one go before the driver looks at the socket again (about 70 kB, some milliseconds)."""
 
 MTU_PROBE_TIMEOUTS = 3
-"""A probe of the path's MTU is given up after this many of its probe timeouts, if that is longer than its own limit."""
+"""A path MTU probe is given up after this many of the path's probe timeouts, if that is longer than its own limit."""
 
 MAX_RUNS_IN_FLIGHT = 1024
-"""With so many runs unacknowledged, FINISHED is sent without remembering it: no window holds it back, and a peer that
-finishes messages but acknowledges nothing would fill the memory. Lost then, it is sent again when the peer asks."""
+"""With this many runs unacknowledged, FINISHED is sent without remembering it: no window holds it back, and a peer that
+finishes messages but acknowledges nothing would fill the memory. If it is lost then, it is sent again when the peer
+asks."""
 MAX_BATCH_DATAGRAMS = 64
-"""As many segments as every kernel's offload takes (UDP_MAX_SEGMENTS of Linux before 6.10)."""
+"""Segments that every kernel's offload takes (UDP_MAX_SEGMENTS of Linux before 6.10)."""
 MAX_BATCH_BYTES = 65_000
 """The largest UDP payload, less a margin."""
 
 
 @dataclass(frozen=True, slots=True)
 class LinkIdentity:
-    """Who we are on this interface."""
+    """Our identity on this interface."""
 
     interface: InterfaceName
     interface_id: InterfaceId
@@ -60,7 +61,7 @@ class LinkIdentity:
     role: Role
     session: SessionId
     token: bytes = field(repr=False)
-    """Our own; each peer knows what follows from it for that peer (`protos/trust/pair_token.py`)."""
+    """Our own token; each peer knows the one derived from it for that peer (`protos/trust/pair_token.py`)."""
     credential: bytes = field(repr=False)
     """Encoded."""
 
@@ -68,13 +69,13 @@ class LinkIdentity:
     def of(
         cls, credential: SessionCredential, token: bytes, interface: InterfaceName, interface_id: InterfaceId
     ) -> LinkIdentity:
-        """Return who the owner of a credential is on this interface."""
+        """Return the identity of a credential's owner on this interface."""
         name, role, session = credential.name, credential.role, credential.session
         return cls(interface, interface_id, name, role, session, token, credential.encode())
 
 
 class Batch(NamedTuple):
-    """Datagrams to one address, back to back: at most MAX_BATCH_DATAGRAMS and MAX_BATCH_BYTES."""
+    """Contiguous datagrams to one address: at most MAX_BATCH_DATAGRAMS and MAX_BATCH_BYTES."""
 
     address: Address
     data: bytes | bytearray | memoryview
@@ -83,11 +84,11 @@ class Batch(NamedTuple):
 
     @property
     def datagrams(self) -> int:
-        """How many datagrams they are."""
+        """Number of datagrams."""
         return -(-len(self.data) // self.segment)
 
     def cut(self) -> list[memoryview]:
-        """The datagrams one by one."""
+        """Return the datagrams one by one."""
         view = memoryview(self.data)
         return [view[start : start + self.segment] for start in range(0, len(view), self.segment)]
 
@@ -107,7 +108,7 @@ class Burst:
         return self.datagrams >= BURST_DATAGRAMS
 
     def add(self, address: Address, data: bytes | bytearray, segment: int, count: int = 1) -> None:
-        """Add `count` datagrams as in a Batch; they join the batch before when they fit."""
+        """Add `count` datagrams as in a Batch; they join the previous batch if they fit."""
         self.datagrams += count
         if self.batches:
             before = self.batches[-1]
@@ -134,11 +135,11 @@ class DatagramBuilder:
         self._stats = stats
 
     def build(self, path: Path, burst: Burst, now: float, *, probing: bool) -> bool:
-        """Add what the path may send now; False when the burst got full first. `probing` allows probes."""
+        """Add what the path may send now; return False if the burst got full first. `probing` allows probes."""
         if path.introductions:
             self._answer_introductions(path, burst, now)
         if path.state is PathState.DOWN and path.control_at <= now:
-            # What is owed goes before what we ask: both count against what may go to an address that is not proven.
+            # What is owed goes before what we ask: both count against what may go to an unproven address.
             self._add_control(path, path.take_control(now), burst, now)
         if probing and path.probe_at <= now:
             self._add_probe(path, burst, now)
@@ -173,7 +174,7 @@ class DatagramBuilder:
                 control.ran_dry()
                 break
             if allowance is not None and run.symbols * run.message.datagram_bytes > allowance:
-                # Until the peer has proven to be there, or sent more from there.
+                # Wait until the peer has proven to be there, or sent more from there.
                 queue.resend(run.message, range(run.first, run.first + run.symbols))
                 path.address.block()
                 control.ran_dry()
@@ -186,7 +187,7 @@ class DatagramBuilder:
         return complete
 
     def _add_run(self, path: Path, remote: Address, run: Run, burst: Burst, now: float) -> int:
-        """Add a run's datagrams and return their bytes. Control frames that wait go with it or before it."""
+        """Add a run's datagrams and return their bytes. Waiting control frames go with it or before it."""
         end, sources = run.first + run.symbols, run.message.count
         path.waits_for_answer(now)
         path.probing.used(now)
@@ -204,7 +205,7 @@ class DatagramBuilder:
     def _add_symbols(
         self, path: Path, remote: Address, message: OutboundMessage, indices: range, burst: Burst, now: float
     ) -> int:
-        """Build a datagram for each symbol, all but the last equally long, and seal each where it lies."""
+        """Build a datagram for each symbol, all but the last equally long, and seal each in place."""
         count = len(indices)
         symbol, message_number, total = message.symbol, message.number, message.total
         left_us = _left_us(path, message, now)
@@ -229,7 +230,7 @@ class DatagramBuilder:
                 view[start + FRAGMENT_DATAGRAM_BYTES : plain_end] = data
                 seal_into(view[start + NONCE_OFFSET : body], view[body:plain_end], view[start:body], view[body:end])
         if message.over:
-            return 0  # whoever ended it meanwhile may count on nothing having left; numbers may be left out
+            return 0  # who ended it meanwhile may count on nothing having left; numbers may be skipped
         del buffer[end:]
         last = end - segment * (count - 1)
         path.recovery.on_run_sent(first_number, count, now, segment, last, message, indices.start)
@@ -240,7 +241,7 @@ class DatagramBuilder:
     def _add_with_control(
         self, path: Path, remote: Address, control: list[bytes], run: Run, burst: Burst, now: float
     ) -> int:
-        """Build one datagram of control frames and a symbol: a small answer and what its request is owed, say."""
+        """Build one datagram of control frames and a symbol, such as a small answer and what its request is owed."""
         message, index = run.message, run.first
         number = path.recovery.take_numbers()
         left_us = _left_us(path, message, now)
@@ -286,7 +287,7 @@ class DatagramBuilder:
 
     def _add_probe(self, path: Path, burst: Burst, now: float) -> None:
         remote = path.remote
-        # Each destination has a probe of its own: the answer tells which of them the peer is at.
+        # Each destination has its own probe: the answer tells at which one the peer is.
         if remote is not None and path.goes_to_one:
             asked = [frame.encode_probe(frame.Probe(path.ask(now, remote)))]
             if (offer := path.offer_keys(now)) is not None:
@@ -312,7 +313,7 @@ class DatagramBuilder:
         self._add_alone(path, address, datagram, burst)
 
     def _answer_introductions(self, path: Path, burst: Burst, now: float) -> None:
-        """Answer to where each came from, and ask back: the reply to that proves who it was, and moves the path."""
+        """Answer each introduction at its source, and ask back: the reply proves who it was, and moves the path."""
         introductions, path.introductions = path.introductions, []
         for address, probe_id, answer in introductions:
             frames = [
@@ -327,7 +328,7 @@ class DatagramBuilder:
             self._add_alone(path, address, datagram, burst)
 
     def _add_mtu_probe(self, path: Path, burst: Burst, now: float) -> None:
-        """Add a padded probe. Nobody waits for its acknowledgement, and its loss says nothing of the rest."""
+        """Add a padded probe. Nobody waits for its acknowledgement, and its loss says nothing of other datagrams."""
         probe_id = path.probing.take_id()
         size = path.mtu.next_probe(probe_id, now, MTU_PROBE_TIMEOUTS * path.recovery.rtt.probe_timeout(0.0))
         if size is None or path.remote is None:
@@ -338,7 +339,7 @@ class DatagramBuilder:
         self._add_alone(path, path.remote, datagram, burst)
 
     def _add_pings(self, path: Path, burst: Burst, now: float) -> None:
-        """Add the pings that wait, as `_add_mtu_probe` does; those of a path that has just gone down are forgotten."""
+        """Add the waiting pings, as `_add_mtu_probe` does; drop those of a path that has just gone down."""
         pings, path.pings = path.pings, []
         if path.state is PathState.DOWN or path.remote is None:
             return
@@ -366,14 +367,17 @@ class DatagramBuilder:
 
 
 def _left_us(path: Path, message: OutboundMessage, now: float) -> int:
-    """How long the message will be of use when what is sent now arrives. One way is taken for half a round trip: where
-    that is too much, the way back is longer than that, and its answer would come no sooner."""
+    """Return how long the message will be of use on arrival.
+
+    One way counts as half a round trip. If that is too much, the way back is longer, and the answer would come no
+    sooner.
+    """
     left_s = message.expires - now - path.recovery.rtt.smoothed / 2
     return min(max(0, int(left_s * 1e6)), MAX_LEFT_US) if left_s < NEVER else MAX_LEFT_US
 
 
 def _fill(control: list[bytes], allowance: int | None) -> list[bytes]:
-    """Take the frames of one datagram from `control`; none if already the first takes more than is allowed (bytes)."""
+    """Take the frames of one datagram from `control`; none if the first already exceeds `allowance` (bytes)."""
     size = 0
     count = 0
     limit = BASE_FRAMES_BYTES if allowance is None else min(allowance, BASE_FRAMES_BYTES)
