@@ -1,1 +1,1 @@
-"""The bytes: datagrams and frames, introductions, messages, forward error correction. Imports `base` and `crypto`."""
+"""Defines the wire format: datagrams and frames, introductions, messages, FEC. Imports `base` and `crypto`."""

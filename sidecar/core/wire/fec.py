@@ -1,8 +1,8 @@
-"""Forward error correction: systematic Reed-Solomon over GF(256), in blocks.
+"""Corrects losses without retransmission: systematic Reed-Solomon over GF(256), in blocks.
 
-A message's symbols are dealt to blocks in turn, symbol i to block i mod B, so that a burst of losses hits every block
-a little. Repair symbol r belongs to block r mod B and is that block's row r div B. Any k symbols of a block of k give
-it back, whichever they are (Rizzo, "Effective Erasure Codes for Reliable Computer Communication Protocols", 1997).
+A message's symbols are dealt to blocks in turn, symbol i to block i mod B, so that a burst of losses hits every block a
+little. Repair symbol r belongs to block r mod B and is that block's row r div B. Any k symbols of a block of k restore
+it (Rizzo, "Effective Erasure Codes for Reliable Computer Communication Protocols", 1997).
 
 Only this file knows the codec. zfec releases the interpreter lock while it computes, about 0.4 us for each source
 symbol of 1150 bytes and each repair symbol.
@@ -20,10 +20,10 @@ if TYPE_CHECKING:
 
 MAX_BLOCK = 128
 """Source symbols of one block. Large blocks need fewer repair symbols for the same protection, but each costs time in
-proportion to the block; with as many repair symbols again the field of 256 is full."""
+proportion to the block. With as many repair symbols the field of 256 is full."""
 
 SYMBOL_COST = 512
-"""What it takes to hand one symbol to the codec, as so many multiplications of a byte."""
+"""Cost of handing one symbol to the codec, in multiplications of a byte."""
 
 
 class _Codec(Protocol):
@@ -33,17 +33,17 @@ class _Codec(Protocol):
 
 
 def block_count(count: int) -> int:
-    """Number of blocks of a message of `count` source symbols."""
+    """Return the number of blocks of a message of `count` source symbols."""
     return -(-count // MAX_BLOCK)
 
 
 def max_repairs(count: int) -> int:
-    """The most repair symbols that a message of `count` source symbols may have, and still have 16-bit indices."""
+    """Return the most repair symbols for `count` source symbols whose indices still fit 16 bits."""
     return min(count, 0x10000 - count)
 
 
 def block_size(count: int, block: int) -> int:
-    """Number of source symbols of one block."""
+    """Return the number of source symbols of one block."""
     blocks = block_count(count)
     return (count - block + blocks - 1) // blocks
 
@@ -57,7 +57,7 @@ def encode(sources: Sequence[bytes | bytearray | memoryview], row: int) -> bytes
 def decode(
     sources: Sequence[bytes | memoryview | None], repairs: dict[int, bytes], first: int, last: int
 ) -> list[tuple[int, bytes]]:
-    """Return the bytes from `first` to `last` of the missing (None) source symbols of a block, with their places.
+    """Return bytes `first` to `last` of a block's missing (None) source symbols, with their places.
 
     `repairs` holds at least as many as are missing, by row (0 <= row < len(sources)); all symbols are equally long.
     """
@@ -67,7 +67,7 @@ def decode(
     rows = iter(repairs.items())
     missing = [place for place, source in enumerate(sources) if source is None]
     for place in missing:
-        # zfec wants every source symbol in its own place, and never ends when a number comes twice.
+        # zfec wants every source symbol in its own place, and never returns if a number comes twice.
         row, repair = next(rows)
         blocks[place] = repair[first:last]
         numbers[place] = size + row
@@ -76,11 +76,11 @@ def decode(
 
 
 def decoding_cost(size: int, missing: int) -> tuple[int, int]:
-    """What it takes to decode a block of `size` source symbols, in multiplications of a byte (0.8 ns).
+    """Return the cost of decoding a block of `size` source symbols, in multiplications of a byte (0.8 ns).
 
-    Returns what one call of `decode` takes, and what each column of bytes takes besides.
+    The first number is the cost of each call of `decode`, the second the additional cost of each column of bytes.
     """
-    # It inverts the rows of what is missing, and looks at each symbol. Measured with 1 to 128 symbols missing of 128.
+    # It inverts the rows of the missing symbols, and looks at each symbol. Measured with 1 to 128 missing of 128.
     return missing * missing * size + size * SYMBOL_COST, missing * size
 
 

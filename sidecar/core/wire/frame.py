@@ -1,4 +1,4 @@
-"""Layout and codec of our datagrams. Integers are big-endian.
+"""Encodes and decodes our datagrams. Integers are big-endian.
 
 Datagram::
 
@@ -16,14 +16,14 @@ Datagram::
     | tag of the AEAD (16 bytes)                                    |
     +---------------------------------------------------------------+
 
-The first 20 bytes stay in clear; they are the associated data, and the last 12 of them the nonce. Flags: bit 0 says
-sealed and is always 1, bit 1 is the phase of the keys (keys.py), bit 2 says introduction (introduction.py: another
-key, and no frames); the others are 0. The first byte tells our datagrams (0xD3) from STUN's (0x00 to 0x3F, RFC 8489
-section 5) on the same socket.
+The first 20 bytes stay in clear; they are the associated data, and the last 12 of them the nonce. Flags: bit 0 means
+sealed and is always 1, bit 1 is the parity of the key phase (keys.py), bit 2 means introduction (introduction.py:
+another key, and no frames); the others are 0. The first byte tells our datagrams (0xD3) from STUN's (0x00 to 0x3F,
+RFC 8489 section 5) on the same socket.
 
 Frames, each a type byte and then::
 
-    PADDING      0  and every zero byte after it             makes a probe as long as the path shall carry (pmtu.py)
+    PADDING      0  and every zero byte after it             pads a probe to the size that is tested (pmtu.py)
     PROBE        1  id (64)                                  is answered at once
     PROBE_REPLY  2  id (64)                                  proves that what stood in the probe was read
     ACK          3  largest (64) delay in us (32) n (8), n times: length - 1 of a range (16), gap - 1 below it (16)
@@ -33,16 +33,16 @@ Frames, each a type byte and then::
     FINISHED     6  message (64)                             the receiver has all of it
     ABANDON      7  message (64)                             the sender will not send the rest
     CLOSE        8  the sidecar goes away
-    FORGOTTEN   10  message (64)                             the receiver dropped what it had of it: send it anew
+    FORGOTTEN   10  message (64)                             the receiver dropped what it had of it: send it again
     KEY_OFFER   11  phase (32) public key (32 bytes) proof (16 bytes)    new keys (key_exchange.py)
     KEY_ANSWER  12  phase (32) public key (32 bytes) proof (16 bytes)
 
 A message of `total size` bytes is cut into symbols of `symbol size` bytes, the last one shorter; `index` counts them.
-`left` is how long the message is still of use when the datagram arrives, as far as its sender can tell: written when
-the datagram is built, so that it is true for each copy and each retransmission, while the symbol's bytes never change.
-Only FRAGMENT, REPAIR and FINISHED are ack-eliciting (RFC 9002 section 2): a PROBE is answered by its reply, the rest
-is not waited for. A datagram holds one ACK at most, and one KEY_OFFER or KEY_ANSWER: each is work, and the newest ACK
-says what all before it did.
+`left` is how long the message is still of use when the datagram arrives, as far as its sender can tell. It is written
+when the datagram is built, so that it holds for each copy and each retransmission, while the symbol's bytes never
+change. Only FRAGMENT, REPAIR and FINISHED are ack-eliciting (RFC 9002 section 2): a PROBE is answered by its reply, and
+nothing waits for the rest. A datagram holds at most one ACK, and one KEY_OFFER or KEY_ANSWER: each costs work, and the
+newest ACK repeats what all earlier ones said.
 """
 
 from __future__ import annotations
@@ -59,30 +59,30 @@ if TYPE_CHECKING:
 
 FIRST_BYTE = 0xD0 | PROTOCOL_VERSION
 FIRST_BYTES = frozenset(0xD0 | version for version in range(OLDEST_PROTOCOL_VERSION, PROTOCOL_VERSION + 1))
-"""Of the versions that are understood: they have one layout."""
+"""First bytes of the versions understood here: they have one layout."""
 SEALED_FLAG, PHASE_FLAG, INTRODUCTION_FLAG = 1, 2, 4
 _KNOWN_FLAGS = frozenset({SEALED_FLAG, SEALED_FLAG | PHASE_FLAG, SEALED_FLAG | INTRODUCTION_FLAG})
 HEADER = struct.Struct(">BBBBQQ")
 HEADER_BYTES = HEADER.size
 NONCE_OFFSET = HEADER_BYTES - NONCE_BYTES
-"""Where the nonce begins in the header: the lower half of the session, and the packet number."""
+"""Where the nonce begins in the header: with the lower half of the session, before the packet number."""
 CLEAR = struct.Struct(">IQQ")
 """The header with its first four bytes as one number: head, session, packet number."""
 MIN_DATAGRAM_BYTES = HEADER_BYTES + 1 + TAG_BYTES
-"""One frame of one byte."""
+"""Datagram with one frame of one byte."""
 
 BASE_BYTES = 1200
 """UDP payload that every path of the Internet carries (RFC 9000 section 14; BASE_PLPMTU)."""
 MAX_DATAGRAM_BYTES = 8952
-"""UDP payload of the longest datagram that is accepted: jumbo frames of 9000 bytes less the headers of IPv6 and UDP;
-larger ones gain nothing more. How long those to a path may be, `pmtu.py` finds out."""
+"""UDP payload of the longest accepted datagram: jumbo frames of 9000 bytes less the headers of IPv6 and UDP. Larger
+ones gain nothing more. `pmtu.py` finds how long datagrams on a path may be."""
 BASE_FRAMES_BYTES = BASE_BYTES - HEADER_BYTES - TAG_BYTES
-"""Frames of a datagram that every path carries."""
+"""Bytes of frames in a datagram that every path carries."""
 
 MAX_MESSAGE_BYTES = 16 * 1024 * 1024 + 1024
-"""Largest payload the product promises (16 MiB) and the head of a message."""
+"""Largest payload the product promises (16 MiB) plus the head of a message."""
 MAX_ACK_RANGES = 32
-"""More ranges than this are news of losses that the sender has long declared."""
+"""More ranges would report losses that the sender has long declared."""
 MAX_FRAMES = 64
 """Frames in one datagram; an honest one holds a handful."""
 
@@ -95,20 +95,20 @@ _NEW_KEY = struct.Struct(">I32s16s")
 _ACK_RANGE = struct.Struct(">HH")
 _FRAGMENT_HEAD = struct.Struct(">QIHHI")
 FRAGMENT_HEAD = struct.Struct(">BQIHHI")
-"""What stands before the symbol in a FRAGMENT or REPAIR, its type byte included."""
+"""What precedes the symbol in a FRAGMENT or REPAIR, its type byte included."""
 FRAGMENT_HEAD_BYTES = FRAGMENT_HEAD.size
 
 FRAGMENT_OVERHEAD_BYTES = HEADER_BYTES + FRAGMENT_HEAD_BYTES + TAG_BYTES
-"""What a datagram that holds nothing but a fragment has beside the symbol."""
+"""Bytes of a datagram with nothing but a fragment, besides the symbol."""
 BASE_SYMBOL_BYTES = BASE_BYTES - FRAGMENT_OVERHEAD_BYTES
-"""Symbol that every path carries."""
+"""Bytes of a symbol that every path carries."""
 MAX_SYMBOL_BYTES = MAX_DATAGRAM_BYTES - FRAGMENT_OVERHEAD_BYTES
 FRAGMENT_DATAGRAM = struct.Struct(">IQQBQIHHI")
-"""What goes before the symbol in a datagram that holds nothing but a FRAGMENT or REPAIR: the header, its first four
-bytes as one number, and the frame's head."""
+"""What precedes the symbol in a datagram with nothing but a FRAGMENT or REPAIR: the header, its first four bytes as one
+number, and the frame's head."""
 FRAGMENT_DATAGRAM_BYTES = FRAGMENT_DATAGRAM.size
 MAX_LEFT_US = 0xFFFFFFFF
-"""71 minutes: more than anything is of use for."""
+"""71 minutes: longer than any message is of use."""
 MIN_SYMBOL_BYTES = 256
 """Smaller symbols would let a peer make us count millions of fragments for one message."""
 
@@ -196,15 +196,15 @@ Frame = Probe | ProbeReply | AckFrame | Fragment | Finished | Abandon | Forgotte
 
 
 class VersionError(DecodeError):
-    """Ours, but of another protocol version."""
+    """One of our datagrams, but of another protocol version."""
 
 
 class UnsealedError(DecodeError):
-    """Ours, but in clear."""
+    """One of our datagrams, but in clear."""
 
 
 def symbol_count(total: int, symbol: int) -> int:
-    """Number of symbols of a message of `total` bytes; an empty message has one, empty, symbol."""
+    """Return the number of symbols of a message of `total` bytes; an empty message has one empty symbol."""
     return max(1, -(-total // symbol))
 
 
@@ -222,8 +222,8 @@ def decode_header(data: bytes | memoryview) -> Header:
     """Parse the clear head.
 
     Raises:
-        VersionError: ours, of another version.
-        UnsealedError: ours, in clear.
+        VersionError: a datagram of ours, of another version.
+        UnsealedError: a datagram of ours, in clear.
         DecodeError: anything else that is not a datagram of ours.
     """
     if len(data) < HEADER_BYTES:
@@ -261,7 +261,7 @@ def encode_key_answer(frame: KeyAnswer) -> bytes:
 
 
 def encode_ack(ranges: Sequence[tuple[int, int]], delay_s: float) -> bytes:
-    """Encode inclusive `ranges`, highest first; those past MAX_ACK_RANGES or too wide to tell are left out."""
+    """Encode inclusive `ranges`, highest first; omit those past MAX_ACK_RANGES or too wide to encode."""
     largest = ranges[0][1]
     body = bytearray()
     count = 0
@@ -281,7 +281,7 @@ def encode_ack(ranges: Sequence[tuple[int, int]], delay_s: float) -> bytes:
 
 
 def encode_fragment_head(message: int, total: int, symbol: int, index: int, left_us: int = MAX_LEFT_US) -> bytes:
-    """Return the bytes that go before the symbol itself."""
+    """Return the bytes that precede the symbol."""
     kind = FRAGMENT_TYPE if index * symbol < total or not index else REPAIR_TYPE
     return FRAGMENT_HEAD.pack(kind, message, total, symbol, index, left_us)
 
@@ -313,15 +313,15 @@ def encode_close() -> bytes:
 
 
 def encode_padding(size: int) -> bytes:
-    """Return a frame of this many bytes that says nothing."""
+    """Return a PADDING frame of this many bytes."""
     return bytes(size)
 
 
 def decode_frames(view: memoryview) -> list[Frame]:
-    """Parse what an opened datagram holds.
+    """Parse the frames of an opened datagram.
 
     Raises:
-        DecodeError: the bytes are not whole frames that we know; nothing of them is to be believed.
+        DecodeError: the bytes are not whole frames that we know; none of them is to be believed.
     """
     frames: list[Frame] = []
     position = 0
@@ -382,7 +382,7 @@ _ABOUT_A_MESSAGE: dict[int, type[Finished | Abandon | Forgotten]] = {
 
 
 def is_repair_index(index: int, total: int, symbol: int) -> bool:
-    """Whether a message of `total` bytes in symbols of `symbol` bytes (not 0) may have this repair symbol."""
+    """Return whether a message of `total` bytes in symbols of `symbol` bytes (not 0) may have this repair symbol."""
     count = symbol_count(total, symbol)
     return count <= index < 2 * count
 

@@ -1,4 +1,4 @@
-"""The datagram by which a sidecar introduces itself on a path that is down; it works without a control plane.
+"""Encodes and opens the datagram that introduces a sidecar on a path that is down, without a control plane.
 
 Layout: the 20 clear bytes of every datagram (flags bit 2 set), then::
 
@@ -8,17 +8,17 @@ Layout: the 20 clear bytes of every datagram (flags bit 2 set), then::
     tag (16 bytes)
 
 The token is the sender's for this receiver (`protos.trust.pair_token`): stable, and known to these two and the control
-plane alone. It is a gate that costs a stranger's datagram a look into a table. Behind it stands ChaCha20-Poly1305 with
-a key from Expand(token, "plr 2 introduction" | session | sender's interface | receiver's interface | receiver's name),
-the clear bytes and the hello id as associated data, and the nonce of every datagram (frame.py): one key for each path
-of a session, on which packet numbers do not repeat.
+plane alone. It is a gate at which a stranger's datagram costs one table lookup. Behind it, ChaCha20-Poly1305 takes its
+key from Expand(token, "plr 2 introduction" | session | sender's interface | receiver's interface | receiver's name),
+the clear bytes and the hello id as associated data, and the nonce of every datagram (frame.py). So there is one key for
+each path of a session, on which packet numbers do not repeat.
 
-The control plane knows the token too, and so does whoever reads the receiver's state folder. So this proves little: the
-credential says who it is, by its signature, and the sealed datagrams that follow prove that it has the session's key.
-Until then nothing moves, nothing counts as received, and the answer is shorter than the question. Who repeats itself
-could not read the answer, since it does not know our session: while the path is down here as well, our own
-introductions, as rare as they are, go there too. The offer of keys has a proof of its own (key_exchange.py): who knows
-no more than the token can make none.
+The control plane knows the token too, and so does anyone who reads the receiver's state folder. So an introduction
+proves little: the signed credential names the sender, and the sealed datagrams that follow prove that it has the
+session's key. Until then no address moves, nothing counts as received, and the answer is shorter than the question. A
+sender that repeats itself could not read the answer, since it does not know our session: while the path is down here as
+well, our own introductions, rare as they are, go there too. The offer of keys has its own proof (key_exchange.py): the
+token alone is not enough to make one.
 """
 
 from __future__ import annotations
@@ -56,17 +56,17 @@ _HEAD = struct.Struct(">QI32s16s")
 _NO_OFFER = KeyOffer(0, bytes(32), bytes(16))
 _KEY_HEAD = struct.Struct(">QBB")
 INTRODUCTION_BYTES = _SEALED_FROM + _HEAD.size + TAG_BYTES
-"""Of an introduction beside its credential."""
+"""Bytes of an introduction besides its credential."""
 MAX_INTRODUCED_BYTES = BASE_BYTES - INTRODUCTION_BYTES
 """Longest credential that can be introduced: every path carries BASE_BYTES."""
 
 
 class UnauthenticError(DecodeError):
-    """Whoever sent it did not know the token, or it was changed on its way."""
+    """The sender did not know the token, or the datagram was changed on its way."""
 
 
 class Introduction(NamedTuple):
-    """What an introduction says; the credential is not verified yet."""
+    """The content of an introduction; the credential is not verified yet."""
 
     probe_id: int
     offer: KeyOffer | None
@@ -80,7 +80,7 @@ def hello_id(token: bytes) -> bytes:
 
 
 def read_hello_id(datagram: memoryview) -> bytes:
-    """Return the hello id of an introduction; shorter than HELLO_BYTES when the datagram is."""
+    """Return the hello id of an introduction; shorter than HELLO_BYTES if the datagram is."""
     return bytes(datagram[HEADER_BYTES:_SEALED_FROM])
 
 
@@ -97,8 +97,8 @@ def open_introduction(header: Header, datagram: memoryview, token: bytes, receiv
     """Open and parse the datagram with this header; `token` is the sender's for us, `receiver` our name.
 
     Raises:
-        UnauthenticError: it is not of one who knows the token.
-        DecodeError: its content breaks the layout, or is of another session.
+        UnauthenticError: the sender does not know the token.
+        DecodeError: its content breaks the layout, or belongs to another session.
     """
     if len(datagram) < _SEALED_FROM:
         raise DecodeError("introduction cut off")

@@ -1,4 +1,4 @@
-"""What a reassembled message holds. Integers are big-endian.
+"""Encodes and decodes reassembled messages. Integers are big-endian.
 
     request    1  request id (16 bytes) copy (8) priority (8) deadline left in us (32) lifetime left in us (32)
                   n (16) service name m (16) type name, payload
@@ -10,13 +10,13 @@
     lists      7  revocation lists, PEM
 
 `copy` numbers the copies of one request; the answer repeats it, so that each copy's latency is known whichever path
-the answer takes. A deadline that is over has 0 left. A cancel is about all copies of its request.
+the answer takes. A passed deadline has 0 left. A cancel applies to all copies of its request.
 
-What a request says to be left was so when its message was made. It waits before it leaves, and parts of it may leave
-again much later, so each datagram tells how much of the lifetime is left by then (frame.py); what is gone of that is
-gone of the deadline too.
+The times left in a request are those when its message was made. It waits before it leaves, and parts of it may leave
+again much later. So each datagram tells how much of the lifetime is left by then (frame.py), and the deadline shrinks
+by as much.
 
-A CA is told by the first 64 bits of its certificate's SHA-256, and one of which there is no list is left out.
+A CA is named by the first 64 bits of its certificate's SHA-256; one without a list is omitted.
 """
 
 from __future__ import annotations
@@ -62,7 +62,7 @@ class RequestMessage:
     payload: bytes | memoryview = field(repr=False)
 
     def when_left(self, lifetime_left_s: float) -> RequestMessage:
-        """Return it as it is by the time that no more than this is left of its lifetime."""
+        """Return the request as it is once at most this much of its lifetime is left."""
         gone_s = self.lifetime_left_s - lifetime_left_s
         if gone_s <= 0:
             return self
@@ -72,7 +72,7 @@ class RequestMessage:
 
 @dataclass(frozen=True, slots=True)
 class ResponseMessage:
-    """The answer to one copy; `processing_s` is the server's own share of the time."""
+    """The answer to one copy; `processing_s` is the server's share of the time."""
 
     request_id: RequestId
     copy: int
@@ -82,7 +82,7 @@ class ResponseMessage:
 
 @dataclass(frozen=True, slots=True)
 class RejectionMessage:
-    """The server did not answer one copy, and why."""
+    """Says that the server did not answer one copy, and why."""
 
     request_id: RequestId
     copy: int
@@ -92,28 +92,28 @@ class RejectionMessage:
 
 @dataclass(frozen=True, slots=True)
 class CancelMessage:
-    """The robot wants no (further) answer to this request."""
+    """Says that the robot wants no (further) answer to this request."""
 
     request_id: RequestId
 
 
 @dataclass(frozen=True, slots=True)
 class RevocationsHeld:
-    """Which revocation lists the sender has: the newest one's number by CA."""
+    """The revocation lists that the sender has: the newest one's number by CA."""
 
     numbers: dict[int, int]
 
 
 @dataclass(frozen=True, slots=True)
 class RevocationsWanted:
-    """The sender has these, and wants newer ones."""
+    """Asks for revocation lists newer than these, which the sender has."""
 
     numbers: dict[int, int]
 
 
 @dataclass(frozen=True, slots=True)
 class RevocationLists:
-    """Revocation lists, PEM; nothing about them is known to be true."""
+    """Revocation lists, PEM; nothing is verified yet."""
 
     pem: bytes = field(repr=False)
 
@@ -123,14 +123,14 @@ Message = RequestMessage | ResponseMessage | RejectionMessage | CancelMessage | 
 
 
 class Encoded(NamedTuple):
-    """A message's bytes, in two parts so that the payload need not be copied."""
+    """A message's bytes, in two parts so that the payload is not copied."""
 
     head: bytes
     payload: bytes | memoryview
 
     @property
     def size(self) -> int:
-        """Bytes of both."""
+        """Bytes of both parts."""
         return len(self.head) + len(self.payload)
 
 
@@ -216,7 +216,7 @@ def _decode_rejection(request_id: RequestId, copy: int, view: memoryview, positi
     try:
         reason = RejectReason(view[position])
     except ValueError:
-        # Of a newer server: it may have run, and so no other may.
+        # From a newer server: the request may have run, so no other server may run it.
         reason = RejectReason.SERVER_LOST
     text, position = _decode_text(view, position + 1, MAX_TEXT_BYTES, errors="replace")
     return RejectionMessage(request_id, copy, reason, clean_text(text))
