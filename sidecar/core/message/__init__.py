@@ -1,1 +1,1 @@
-"""One message in symbols: sent, put together, repaired. Imports `base` and `wire`."""
+"""Sends, reassembles and repairs one message in symbols. Imports `base` and `wire`."""

@@ -1,8 +1,8 @@
-"""Messages that came with enough repair symbols, and are still to be computed: a line for each peer.
+"""Queues messages that still have to be computed from their repair symbols: a line for each peer.
 
-The driver computes them on a thread of its own, a slice at a time, and asks for the next after each (`net/decoder.py`).
-The peers have their slices in turn, so a peer whose messages take long to compute delays those of others by one slice
-each time, however many it sends.
+The driver computes them on a separate thread, a slice at a time, and asks for the next after each (`net/decoder.py`).
+The peers take turns, so a peer whose messages take long to compute delays those of others by one slice each time,
+however many it sends.
 """
 
 from __future__ import annotations
@@ -21,15 +21,15 @@ if TYPE_CHECKING:
     from sidecar.core.message.partial import Partial
 
 MAX_BYTES = 128 * 1024 * 1024
-"""What messages in line hold, repair symbols included. One peer may hold half: two of the largest that came as repair
-symbols alone."""
+"""Bytes of the messages in line, repair symbols included. One peer may hold half: two of the largest that came as
+repair symbols alone."""
 MAX_MESSAGES = 16_384
 """Messages in line; one peer may have half of them, as many as requests may be in flight to it."""
 
 
 @dataclass(slots=True, eq=False)
 class Decoding:
-    """A message to compute from its symbols: work for whoever drives the engine, while nothing is locked."""
+    """A message to compute from its symbols, by whoever drives the engine, while nothing is locked."""
 
     path: PathId
     session: SessionId
@@ -40,12 +40,12 @@ class Decoding:
         self._slices = self.partial.decode()
 
     def run_slice(self) -> bool:
-        """Compute a slice, in some milliseconds at most; returns whether that was the last."""
+        """Compute a slice, in some milliseconds at most; return whether it was the last."""
         return next(self._slices, self) is self
 
 
 class DecodingLine:
-    """What is to be decoded, of all peers."""
+    """The messages of all peers that wait to be decoded."""
 
     __slots__ = ("_bytes", "_messages", "_of")
 
@@ -53,25 +53,25 @@ class DecodingLine:
         self._bytes = Shares(MAX_BYTES)
         self._messages = Shares(MAX_MESSAGES)
         self._of: OrderedDict[NodeName, deque[Decoding]] = OrderedDict()
-        """Oldest first; the peer whose turn is longest ago first."""
+        """Each peer's messages, oldest first; the peers by their last turn, longest ago first."""
 
     def __len__(self) -> int:
-        """Messages in line."""
+        """Return the number of messages in line."""
         return self._messages.used
 
     def fits(self, peer: NodeName, partial: Partial) -> bool:
-        """Whether this message may stand in line."""
+        """Return whether this message may join the line."""
         return self._messages.fits(peer) and self._bytes.fits(peer, partial.held_bytes)
 
     def add(self, decoding: Decoding) -> None:
-        """It stands in line from now on; asking `fits` before is the caller's."""
+        """Add a message to the line; the caller asks `fits` before."""
         peer = decoding.path.peer
         self._messages.take(peer)
         self._bytes.take(peer, decoding.partial.held_bytes)
         self._of.setdefault(peer, deque()).append(decoding)
 
     def next(self) -> Decoding | None:
-        """Return the one whose slice is next. It stays at the head of its peer's line until it is `done`."""
+        """Return the message whose slice is next. It stays at the head of its peer's line until it is `done`."""
         peer = next(iter(self._of), None)
         if peer is None:
             return None
@@ -79,7 +79,7 @@ class DecodingLine:
         return self._of[peer][0]
 
     def done(self, decoding: Decoding) -> bool:
-        """It is computed, or never will be; returns whether it was the head of its peer's line still."""
+        """Remove a message that is computed, or never will be; return whether it still headed its peer's line."""
         peer = decoding.path.peer
         line = self._of.get(peer)
         if line is None or line[0] is not decoding:
@@ -91,7 +91,7 @@ class DecodingLine:
         return True
 
     def forget_peer(self, peer: NodeName) -> int:
-        """The peer's session is over; returns how many messages go with it."""
+        """Drop the messages of a peer whose session is over; return how many."""
         line = self._of.pop(peer, ())
         for decoding in line:
             self._give_back(decoding)

@@ -1,4 +1,4 @@
-"""A message on its way out, shared by the links that carry its fragments."""
+"""Holds an outgoing message, shared by the links that carry its fragments."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ if TYPE_CHECKING:
 
 
 class OutboundMessage:
-    """The bytes of one message and which symbols have arrived.
+    """The bytes of one message, and which symbols have arrived.
 
-    Links on several threads share it without a lock: `acked` bytes, `begun` and `over` only ever go from 0 to 1 (but
-    for a byte of what the peer is asked after, `Outbox.ask_again`), and a link that reads an old value of these or of
-    `expected_at` merely sends a symbol that is no longer needed, or a little later.
+    Links on several threads share it without a lock: `acked` bytes, `begun` and `over` only ever go from 0 to 1 (except
+    one `acked` byte that `Outbox.ask_again` clears). A link that reads an old value of these or of `expected_at` merely
+    sends a symbol that is no longer needed, or a little later.
 
     The payload is never copied as a whole: a symbol is a view of it (the first ones hold the head and are joined),
     which goes into its datagram in the link's thread. That is the only copy on the way out.
@@ -72,65 +72,65 @@ class OutboundMessage:
     ) -> None:
         self.number = number
         self.path = path
-        """Where it was sent first."""
+        """The path it was first sent over."""
         self.interfaces = {path.interface}
-        """Those it was sent over; the engine's, links do not look at this."""
+        """The interfaces it was sent over; for the engine only."""
         self.content = content._replace(payload=memoryview(content.payload))
         self.total = content.size
         self.priority = priority
         self.deadline = deadline
         self.expires = expires
         self.expected_at = NEVER
-        """When its answer is expected, as the path that sends it last said; NEVER while none does."""
+        """When its answer is expected, as last said by the path that sends it; NEVER while none does."""
         self.siblings = [] if siblings is None else siblings
-        """What carries the same request, this message as well, or nothing: what one is expected to do, others need not
-        hurry to. Whoever shares the list clears it, lest messages hold each other in memory."""
+        """The messages that carry the same request, this one included, or none: others need not hurry to do what one is
+        expected to do. The owner of the list clears it, so that messages do not hold each other in memory."""
         if siblings is not None:
             siblings.append(self)
         self.count = symbol_count(self.total, symbol)
-        """Source symbols."""
+        """Number of source symbols."""
         self.repairs = min(repairs, fec.max_repairs(self.count))
-        """Repair symbols, which follow the source symbols."""
+        """Number of repair symbols, which follow the source symbols."""
         # A repair symbol is as long as the longest source symbol: make them equal.
         self.symbol = max(MIN_SYMBOL_BYTES, -(-self.total // self.count)) if repairs else symbol
         self.acked = bytearray(self.symbols)
         self.answers = answers
-        """The request that it answers; the engine's, links do not look at this."""
+        """The request that it answers; for the engine only."""
         self.copy_of = copy_of
-        """The request that it is a copy of; the engine's as well."""
+        """The request that it is a copy of; for the engine only."""
         self.begun = False
-        """Something of it may have left."""
+        """Whether some of it may have left."""
         self.unreported = False
-        """The peer had enough of it when the engine looked last, and had not said so."""
+        """Whether the peer, when the engine last looked, had enough of it but had not reported it FINISHED."""
         self.over = False
-        """Delivered, called off, expired or cut anew: nothing of it needs to travel any more."""
+        """Whether it is delivered, called off, expired or cut again: none of it has to travel any more."""
         self.successor: OutboundMessage | None = None
-        """The same bytes, cut anew into smaller symbols."""
+        """The same bytes, cut again into smaller symbols."""
         self.generation = 0
-        """How many messages before this one carried the same bytes."""
+        """Number of earlier messages with the same bytes."""
         self._copies: dict[int, int] = {}
-        """Symbols of which more than one datagram is under way: how many more."""
+        """For each symbol with several datagrams in flight, how many more than one."""
         self._lost: set[int] = set()
         self._lost_repairs: set[int] = set()
 
     @property
     def peer(self) -> NodeName:
-        """Whom it is for."""
+        """The peer that it is for."""
         return self.path.peer
 
     @property
     def symbols(self) -> int:
-        """Source and repair symbols."""
+        """Number of source and repair symbols."""
         return self.count + self.repairs
 
     @property
     def held_bytes(self) -> int:
-        """What the message may hold at the receiver before it is whole."""
+        """Bytes that the message may occupy at the receiver before it is whole."""
         return self.total + self.repairs * self.symbol
 
     @property
     def newest(self) -> OutboundMessage:
-        """What the bytes travel as by now: this message, or what it was cut into."""
+        """The message that carries the bytes now: this one, or what it was cut into."""
         message = self
         while message.successor is not None:
             message = message.successor
@@ -138,9 +138,9 @@ class OutboundMessage:
 
     @property
     def may_have_left(self) -> bool:
-        """Whether anything of these bytes may have left, as whatever they were cut into.
+        """Whether any of these bytes may have left, in this message or one it was cut into.
 
-        False is certain only of a message that is over already: its link looks at `over` after it has set `begun`.
+        False is certain only once the message is over: its link looks at `over` after it has set `begun`.
         """
         message = self
         while not message.begun and message.successor is not None:
@@ -153,7 +153,7 @@ class OutboundMessage:
         return min(self.total, self.symbol) + FRAGMENT_OVERHEAD_BYTES
 
     def cut_anew(self, number: int, path: PathId, symbol: int) -> OutboundMessage:
-        """Return the same bytes as another message, for paths that carry no more than `symbol` bytes at once.
+        """Return the same bytes as another message, for paths that carry at most `symbol` bytes at once.
 
         Its symbols do not complete those of this one at the receiver.
         """
@@ -176,30 +176,30 @@ class OutboundMessage:
         return self.successor
 
     def stand_down(self) -> None:
-        """Whether it gets an answer is uncertain now: its siblings are not to rely on it."""
+        """Leave the siblings, which must not rely on it: its answer is uncertain now."""
         if self in self.siblings:
             self.siblings.remove(self)
 
     def missing(self) -> tuple[int, ...]:
-        """The symbols that did not arrive, as far as is known."""
+        """Return the symbols that did not arrive, as far as is known."""
         return tuple(index for index in range(self.symbols) if self.needs(index))
 
     def give_up(self) -> tuple[int, ...]:
-        """Return what is missing, whatever of it is under way: nobody will tell any more. The engine's, as `lost`."""
+        """Return what is missing, even if in flight: nobody will report it any more. For the engine only, as `lost`."""
         self._copies.clear()
         return self.missing()
 
     def copied(self, indices: Iterable[int]) -> None:
-        """Note that these symbols travel once more than they were lost. The engine's, as `lost`."""
+        """Note that these symbols travel once more than they were lost. For the engine only, as `lost`."""
         for index in indices:
             self._copies[index] = self._copies.get(index, 0) + 1
 
     def needs(self, index: int) -> bool:
-        """Whether this symbol still has to travel."""
+        """Return whether this symbol still has to travel."""
         return not self.over and not self.acked[index]
 
     def symbol_data(self, index: int) -> bytes | memoryview:
-        """Return one symbol. A repair symbol is computed here, on the caller's thread, each time it is asked for."""
+        """Return one symbol. A repair symbol is computed here, on the caller's thread, each time."""
         self.begun = True
         if index >= self.count:
             return self._repair(index - self.count)
@@ -227,10 +227,10 @@ class OutboundMessage:
         return fec.encode(sources, repair // blocks)
 
     def lost(self, indices: Iterable[int]) -> tuple[int, ...]:
-        """Note symbols as lost; returns the source symbols that must travel again. The engine's, as `interfaces`.
+        """Note lost symbols; return the source symbols that must travel again. For the engine only, as `interfaces`.
 
-        A symbol of which another copy is under way does not. Of a block that lost no more source symbols than it has
-        repair symbols which arrived or still may, nothing does; a lost repair symbol never does.
+        A symbol with another copy in flight does not. In a block that lost at most as many source symbols as it has
+        repair symbols that arrived or still may, none does. A lost repair symbol never does.
         """
         indices = [index for index in indices if self.needs(index) and not self._is_copied(index)]
         if not self.repairs:
@@ -254,7 +254,7 @@ class OutboundMessage:
         return tuple(sorted(again))
 
     def _is_copied(self, index: int) -> bool:
-        """Whether another copy of a lost one is under way; it counts as the last one from now on."""
+        """Return whether a lost symbol has another copy in flight, and count that copy off."""
         more = self._copies.get(index, 0)
         if more > 1:
             self._copies[index] = more - 1

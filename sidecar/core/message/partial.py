@@ -1,4 +1,4 @@
-"""A message of which some symbols are still missing: one buffer that symbols are written into as they come."""
+"""Holds a message with missing symbols: one buffer that symbols are written into as they come."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ LAZY_BYTES = 1024 * 1024
 """From this size on, a buffer's pages are claimed as they are written: announcing 16 MiB must cost nothing."""
 
 SLICE_OPERATIONS = 4_000_000
-"""What is computed in one go, in multiplications of a byte: some 3 ms. The largest block takes most of that to find out
-how (`fec.decoding_cost`), for each slice again."""
+"""Work of one slice, in multiplications of a byte: some 3 ms. The largest block spends most of that on its matrix
+(`fec.decoding_cost`), again for each slice."""
 
 
 class Partial:
-    """The symbols of one message that came, in their places.
+    """The received symbols of one message, in their places.
 
     `have` and `buffer` are for the reassembler's loop, which writes source symbols itself.
     """
@@ -48,29 +48,29 @@ class Partial:
         self.symbol = symbol
         self.count = symbol_count(total, symbol)
         self.missing = self.count
-        """Source symbols that did not come."""
+        """Number of source symbols that have not come."""
         self.have = bytearray(self.count)
         """1 for each source symbol that came."""
         self.buffer = _claim(total)
         self.repairs = 0
-        """Repair symbols stored."""
+        """Number of repair symbols stored."""
         self.touched_at = now
         self.ends_at = NEVER
-        """When the message is of no use any more: the earliest that a symbol told, as what was under way for longest
+        """When the message stops being of use: the earliest time that a symbol told, since the symbol longest in flight
         tells too late an end."""
         self._blocks = fec.block_count(self.count)
         self._rows: dict[int, dict[int, bytes]] = {}
         """Repair symbols by block and row."""
         self._decodable_blocks = 0
-        """The first so many blocks miss no more than they have repair symbols for, and never will again."""
+        """Number of leading blocks that miss no more than they have repair symbols for, and never will again."""
 
     @property
     def held_bytes(self) -> int:
-        """Bytes claimed by what was announced and by repair symbols."""
+        """Bytes claimed by the announced size and by repair symbols."""
         return self.total + self.repairs * self.symbol
 
     def wants_repair(self, repair: int) -> bool:
-        """Whether this repair symbol is new and its block misses more than it has repair symbols for."""
+        """Return whether this repair symbol is new and its block misses more than it has repair symbols for."""
         row, block = divmod(repair, self._blocks)
         rows = self._rows.get(block, {})
         return row not in rows and len(rows) < self._missing_in(block)
@@ -82,7 +82,7 @@ class Partial:
         self.repairs += 1
 
     def is_decodable(self) -> bool:
-        """Whether what is missing can be computed. Over a message's whole life, every block is looked at once."""
+        """Return whether what is missing can be computed. Each block is looked at once in a message's life."""
         if self.missing > self.repairs:
             return False
         while self._decodable_blocks < self._blocks:
@@ -96,11 +96,11 @@ class Partial:
         return self.have[block :: self._blocks].count(0)
 
     def whole(self) -> memoryview:
-        """Return the message; nothing is missing, or it is decoded."""
+        """Return the message, which has nothing missing or is decoded."""
         return memoryview(self.buffer)
 
     def decode(self) -> Iterator[None]:
-        """Compute what is missing, a slice at each step; then the message is `whole`. Not for under a lock.
+        """Compute what is missing, a slice at each step; then the message is `whole`. Never call it under a lock.
 
         A slice is SLICE_OPERATIONS at most, some milliseconds: some blocks, or some columns of one (any byte of a
         symbol depends on the same byte of the others alone). Symbols of a dishonest sender give a message of garbage.

@@ -1,7 +1,7 @@
-"""Reassembly of messages from symbols that may come over any path of a peer; capped in bytes, count and age.
+"""Reassembles messages from symbols that may come over any path of a peer; capped in bytes, count and age.
 
-What is dropped unfinished was acknowledged in part and would never be completed by what still comes. Its number is
-remembered, and a further symbol of it is answered FORGOTTEN: the sender sends the message anew, under another number.
+What is dropped unfinished was acknowledged in part, so what still comes would never complete it. Its number is
+remembered, and a further symbol of it is answered FORGOTTEN: the sender sends the message again, under another number.
 """
 
 from __future__ import annotations
@@ -21,13 +21,13 @@ if TYPE_CHECKING:
 
 MAX_PEER_BYTES = 64 * 1024 * 1024
 """Announced bytes of one peer's unfinished messages: almost four of the largest. A sender keeps below it (`outbox.py`)
-unless it hears nothing of what it called off (ABANDON is sent once)."""
+unless what it called off is still held here (ABANDON is sent once)."""
 MAX_PEER_MESSAGES = 8192
 """Unfinished messages of one peer: as many as requests may be in flight to it."""
 MAX_AGE_S = 30.0
-"""An unfinished message that got no symbol for this long is dropped."""
+"""An unfinished message that gets no symbol for this long is dropped."""
 OVER_REMEMBERED = 8192
-"""Message numbers kept per peer that are finished, forgotten or abandoned, so that late symbols are recognised."""
+"""Finished, forgotten or abandoned message numbers kept per peer, so that late symbols are recognised."""
 
 
 class Fate(enum.Enum):
@@ -41,14 +41,14 @@ class Fate(enum.Enum):
 
 
 class Reassembled(NamedTuple):
-    """What the sender of a message has to be told, once for all the symbols added together."""
+    """What to tell the sender of a message, once for all the symbols added together."""
 
     number: int
     fate: Fate
     content: memoryview | Partial | None
-    """The message, when it was finished just now; a Partial still has to be decoded."""
+    """The message, if it was just finished; a Partial still has to be decoded."""
     ends_at: float = NEVER
-    """When what was finished just now is of no use any more."""
+    """When a message that was just finished stops being of use."""
 
 
 class Reassembler:
@@ -59,7 +59,7 @@ class Reassembler:
     def __init__(self, peer: NodeName, dropped: Counter[str]) -> None:
         self.peer = peer
         self._partials: OrderedDict[int, Partial] = OrderedDict()
-        """The one that waits longest for news first."""
+        """Sorted by the last symbol, longest ago first."""
         self._over: OrderedDict[int, Fate] = OrderedDict()
         self._bytes = 0
         self._dropped = dropped
@@ -70,11 +70,11 @@ class Reassembler:
         return self._bytes
 
     def __len__(self) -> int:
-        """How many messages are unfinished."""
+        """Return the number of unfinished messages."""
         return len(self._partials)
 
     def add(self, fragments: list[Fragment], now: float) -> list[Reassembled]:
-        """Store symbols; returns what there is to tell.
+        """Store symbols; return what there is to tell.
 
         Each symbol is copied once, to its place in the message: nothing that is returned views a datagram.
         """
@@ -130,16 +130,16 @@ class Reassembler:
         left_us: int,
         out: dict[int, Reassembled],
     ) -> Partial | None:
-        """A symbol of a message that is not being put together; returns the Partial to store it in, if any."""
+        """Handle a symbol of a message without a Partial; return the Partial to store it in, if any."""
         fate = self._over.get(number)
         if fate is not None:
             if fate is not Fate.ABANDONED:
                 out.setdefault(number, Reassembled(number, fate, None))
             return None
         if total <= symbol:
-            # Of a lone symbol, the repair symbol is its padded copy.
+            # The repair symbol of a lone symbol is its padded copy.
             self._remember(number, Fate.FINISHED)
-            # A copy: the datagram's buffer is used again.
+            # A copy, since the datagram's buffer is reused.
             whole, ends_at = memoryview(bytes(data[:total])), now + left_us * 1e-6
             out[number] = Reassembled(number, Fate.FINISHED, whole, ends_at)
             return None
@@ -184,7 +184,7 @@ class Reassembler:
             self._over.popitem(last=False)
 
     def abandon(self, number: int) -> None:
-        """The sender does not send the rest of this message."""
+        """Drop this message: the sender does not send the rest."""
         partial = self._partials.get(number)
         if partial is not None:
             self._remove(partial)
@@ -193,7 +193,7 @@ class Reassembler:
             self._remember(number, Fate.ABANDONED)
 
     def forgo(self, number: int) -> None:
-        """A message that was finished has no room to be decoded: what still comes of it is answered FORGOTTEN."""
+        """Mark a finished message as forgotten, since it has no room to be decoded: further symbols get FORGOTTEN."""
         self._over[number] = Fate.FORGOTTEN
 
     def expire(self, now: float) -> None:

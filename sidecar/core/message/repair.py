@@ -14,27 +14,27 @@ from sidecar.core.wire import fec
 FAST_DATAGRAMS = 200.0
 """Memory of the estimate that rises soon after losses begin ..."""
 SLOW_DATAGRAMS = 2000.0
-"""... and of the one that keeps them in mind; the larger of the two counts."""
+"""... and of the one that remembers them longer; the larger of the two counts."""
 FIRST_DATAGRAMS = 100.0
-"""As if so many had arrived on a new path: one loss among the first few is no loss rate."""
+"""Datagrams counted as arrived on a new path: one loss among the first few is no loss rate."""
 MAX_DISPERSION = 8.0
 """Longer bursts than this are outages: no number of repair symbols bridges them."""
 
 
 class Loss(NamedTuple):
-    """What to expect of a path."""
+    """The expected loss of a path."""
 
     share: float = 0.0
-    """Of the datagrams, 0 to 1."""
+    """Share of the datagrams, 0 to 1."""
     dispersion: float = 1.0
-    """Variance of the number lost, in multiples of what independent losses have; about twice a burst's length."""
+    """Variance of the number lost, relative to that of independent losses; about twice a burst's length."""
 
 
 class LossEstimate:
-    """Fading averages by datagrams, not by time: a quiet path forgets nothing.
+    """Averages that fade by datagrams, not by time: a quiet path forgets nothing.
 
-    Only fates that are known count: datagrams acknowledged, and those found missing while others arrived. What a dead
-    path swallowed says nothing of the path when it lives.
+    Only known fates count: datagrams acknowledged, and those found missing while others arrived. What a dead path
+    swallowed says nothing of the path when it lives.
     """
 
     __slots__ = ("_expected", "_fast", "_slow", "_squares", "_weight")
@@ -58,14 +58,14 @@ class LossEstimate:
         pull = min(1.0, known / self._weight)
         self._slow += (share - self._slow) * pull
         kept = math.exp(-known / SLOW_DATAGRAMS)
-        # The average was pulled towards what it is compared with: divide that out, as in any sample's variance.
+        # The average was pulled towards the value it is compared with: divide that out, as in any sample variance.
         self._squares = self._squares * kept + (missed - self._slow * known) ** 2 / (1.0 - min(pull, 0.9))
         self._expected = self._expected * kept + self._slow * known
 
     @property
     def loss(self) -> Loss:
-        """What to expect from now on."""
-        # Fewer losses than a handful tell nothing of bursts.
+        """The loss to expect from now on."""
+        # Fewer than a handful of losses tell nothing of bursts.
         dispersion = (self._squares + 5.0) / (self._expected + 5.0)
         return Loss(max(self._fast, self._slow), min(max(dispersion, 1.0), MAX_DISPERSION))
 
@@ -77,15 +77,15 @@ FAILURES = 0.002
 """Share of messages that may still need a retransmission."""
 FLOOR = 0.0005
 """Below this loss nothing is added: sixteen of seventeen messages of 150 kB get through untouched, and a single loss
-long ago costs nothing for ever."""
+long ago stops costing anything."""
 MAX_RATIO = 0.5
-"""Of the source symbols, when the measured loss decides: beyond it, sending again is cheaper."""
+"""Most repair symbols per source symbol when the measured loss decides: beyond it, sending again is cheaper."""
 WORTH_A_COPY = 0.005
-"""What is lost with this probability, at the cost of a further round trip, travels twice: see `worth_a_copy`."""
+"""Datagrams with at least this probability of a loss, which costs a round trip, travel twice: see `worth_a_copy`."""
 MAX_COPIES = 16
-"""So many symbols lost at once, and no more, travel twice: more of them are an outage or a full queue."""
+"""Most symbols lost at once that travel twice: more of them are an outage or a full queue."""
 _STEPS_PER_OCTAVE = 4
-"""Losses are rounded up to so many steps, so that results can be kept."""
+"""Losses are rounded up to this many steps per octave, so that results can be cached."""
 
 
 def repair_symbols(count: int, redundancy: Redundancy, loss: Loss) -> int:
@@ -104,18 +104,19 @@ def repair_symbols(count: int, redundancy: Redundancy, loss: Loss) -> int:
 
 
 def worth_a_copy(datagrams: int, loss: Loss) -> bool:
-    """Whether datagrams that nothing else covers, and whose loss costs a round trip, should travel twice.
+    """Return whether datagrams that nothing else covers, and whose loss costs a round trip, should travel twice.
 
-    Such are a message's last one, whose loss only a timeout tells (also the answer of one datagram: its loss makes
-    the whole exchange late), and those that are sent again: about 5 % of messages of 150 kB lose one of them at 2 %
-    loss. Copies and not repair symbols, since they are few, need no coding on either side, and can take another path.
+    One such is a message's last datagram, whose loss only a timeout tells (also a one-datagram answer, whose loss makes
+    the whole exchange late). Others are those sent again: about 5 % of messages of 150 kB lose one of them at 2 % loss.
+    They get copies instead of repair symbols, since they are few, need no coding on either side, and can take another
+    path.
     """
     return datagrams <= MAX_COPIES and 1.0 - (1.0 - loss.share) ** datagrams >= WORTH_A_COPY
 
 
 @lru_cache(maxsize=4096)
 def _of_block(size: int, blocks: int, burst: int, step: int) -> int:
-    """The fewest repair symbols with which a block of `size` fails no more often than FAILURES / blocks.
+    """Return the fewest repair symbols with which a block of `size` fails at most in a share of FAILURES / blocks.
 
     Bursts of `burst` datagrams are lost independently of each other (binomial).
     """
@@ -128,7 +129,7 @@ def _of_block(size: int, blocks: int, burst: int, step: int) -> int:
 
 
 def _more_than(most: int, trials: int, share: float) -> float:
-    """Probability that more than `most` of `trials` happen."""
+    """Return the probability that more than `most` of `trials` happen."""
     probability = (1.0 - share) ** trials
     below = probability
     for hits in range(1, most + 1):
