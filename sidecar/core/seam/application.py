@@ -1,4 +1,4 @@
-"""What the data plane tells the application side (the ROS bridge), and what it is told, as values."""
+"""Defines the values that the data plane and the application side (the ROS bridge) exchange."""
 
 from __future__ import annotations
 
@@ -29,15 +29,14 @@ class WithdrawService:
 
 @dataclass(frozen=True, slots=True)
 class ResponseArrived:
-    """A response to a request, whether it can be delivered or not: `judge_answer` says which. Until then another one
-    may come."""
+    """A response to a request. `judge_answer` says whether it can be delivered; until then another one may come."""
 
     request_id: RequestId
     service: ServiceName
     copy: int
     """Which copy of the request was answered."""
     payload: bytes | memoryview = field(repr=False)
-    """A view is of a buffer of its own: whoever wants bytes copies them, which takes milliseconds for the largest."""
+    """A view of its own buffer: a consumer that needs bytes copies them, which takes milliseconds for the largest."""
     server: NodeName
     interface: InterfaceName
     elapsed_s: float
@@ -48,7 +47,7 @@ class ResponseArrived:
 class DeadlineMissed:
     """A request's deadline passed without a response; the request goes on until its lifetime ends.
 
-    Not told of a request that the application has its answer to (`answered_here`).
+    Not sent for a request that the application already has an answer to (`answered_here`).
     """
 
     request_id: RequestId
@@ -59,7 +58,7 @@ class DeadlineMissed:
 
 @dataclass(frozen=True, slots=True)
 class Unreachable:
-    """No path to any server of the request is up, and its service has a fallback. Told once for each request."""
+    """No path to any server of the request is up, and its service has a fallback. Sent once for each request."""
 
     request_id: RequestId
     service: ServiceName
@@ -68,7 +67,9 @@ class Unreachable:
 @dataclass(frozen=True, slots=True)
 class RequestFailed:
     """No response will come. `outcome` is a label of plr_requests_total: failed, rejected or late_dropped.
-    Of a request with `answered_here`: deadline_missed."""
+
+    For a request with `answered_here` it is deadline_missed.
+    """
 
     request_id: RequestId
     service: ServiceName
@@ -85,28 +86,28 @@ class ExecuteRequest:
     service: ServiceName
     type: str
     payload: bytes | memoryview = field(repr=False)
-    """A view is of a buffer of its own: whoever wants bytes copies them, which takes milliseconds for the largest."""
+    """A view of its own buffer: a consumer that needs bytes copies them, which takes milliseconds for the largest."""
     robot: NodeName
     priority: Priority
     deadline_s: float
-    """Seconds from now after which the answer is late; 0 when it is late already."""
+    """Seconds from now after which the answer is late; 0 if it is late already."""
     expires_s: float
     """Seconds from now after which nobody waits for the answer."""
 
 
 @dataclass(frozen=True, slots=True)
 class AbandonExecution:
-    """The local server took too long with this execution, or nobody waits for it any more: forget it."""
+    """Forget this execution: the local server took too long, or nobody waits for it any more."""
 
     execution: ExecutionId
     robot: NodeName
     awaited: bool = False
-    """A robot waits still: refuse it, for a reason that says whether the local server got it."""
+    """Whether a robot still waits: refuse it, with a reason that says whether the local server got it."""
 
 
 @dataclass(frozen=True, slots=True)
 class CancelExecution:
-    """The robot has its answer: refuse this execution as CANCELLED unless the local server has it already."""
+    """Refuse this execution as CANCELLED unless the local server already has it: the robot has its answer."""
 
     execution: ExecutionId
     robot: NodeName
@@ -114,7 +115,7 @@ class CancelExecution:
 
 @dataclass(frozen=True, slots=True)
 class CallsForbidden:
-    """A robot asked for what it may not call, `count` times since this was told last; `service` is the latest."""
+    """A robot asked for what it may not call, `count` times since the last such event; `service` is the latest."""
 
     robot: NodeName
     service: ServiceName

@@ -1,4 +1,4 @@
-"""What passes between a link (one interface, its own thread) and the engine (the requests): values only."""
+"""Defines the values that pass between a link (one interface, its own thread) and the engine (the requests)."""
 
 from __future__ import annotations
 
@@ -21,33 +21,33 @@ class LinkPeer:
     name: NodeName
     session: SessionId
     token: bytes = field(repr=False)
-    """What it introduces itself to us with."""
+    """The token with which it introduces itself to us."""
     incarnation: int
     credential: bytes = field(repr=False)
     keys: PairKeys
     addresses: tuple[tuple[InterfaceId, tuple[Address, ...]], ...]
     """For each of the peer's interfaces, where it may be reached."""
     era: int = 0
-    """How often the name was given to somebody new, because the one before was revoked: its sessions never return."""
+    """How often the name passed to somebody new because its holder was revoked: the earlier sessions never return."""
 
 
 @dataclass(frozen=True, slots=True)
 class SetPeers:
-    """All peers that may be talked to; a peer with a new session starts afresh."""
+    """Set all peers that may be talked to; a peer with a new session starts from scratch."""
 
     peers: tuple[LinkPeer, ...]
 
 
 @dataclass(frozen=True, slots=True)
 class SetReady:
-    """Whether the interface may be used yet (its STUN succeeded, or no STUN server answers anybody)."""
+    """Set whether the interface may be used yet (its STUN succeeded, or no STUN server answers anybody)."""
 
     ready: bool
 
 
 @dataclass(frozen=True, slots=True)
 class SetCarrier:
-    """Whether the interface can carry anything: without carrier or address its paths are down at once, unprobed."""
+    """Set whether the interface can carry anything; without carrier or address its paths are down at once, unprobed."""
 
     on: bool
     why_not: str = "no carrier"
@@ -56,64 +56,66 @@ class SetCarrier:
 
 @dataclass(frozen=True, slots=True)
 class ResetPaths:
-    """All paths are down until they answer anew; what they carried goes back to the engine."""
+    """Take all paths down until they answer again; what they carried goes back to the engine."""
 
     reason: str
 
 
 @dataclass(frozen=True, slots=True)
 class Rebind:
-    """Addresses or gateways of the interface changed: of paths which that concerns, what was measured is void, and
-    their peers must learn where we are."""
+    """Handle changed addresses or gateways of the interface.
+
+    What was measured on affected paths is void, and their peers must learn where we are.
+    """
 
     lost: frozenset[str]
-    """Addresses that nothing leaves from any more."""
+    """Local addresses that nothing leaves from any more."""
     rerouted: frozenset[int]
-    """Families (4, 6) whose gateways are others now."""
+    """Families (4, 6) whose gateways changed."""
 
 
 @dataclass(frozen=True, slots=True)
 class SetCredential:
-    """Introduce this session by this credential (encoded) from now on: it was signed anew."""
+    """Introduce this session by this credential (encoded) from now on: it was signed again."""
 
     credential: bytes
 
 
 @dataclass(frozen=True, slots=True)
 class Seek:
-    """A request waits for any path to these peers: probe those that are down, however long they have been."""
+    """Probe the paths to these peers that are down, however long they have been: a request waits for any of them."""
 
     peers: frozenset[NodeName]
 
 
 @dataclass(frozen=True, slots=True)
 class CheckPaths:
-    """Something else than datagrams is not answered over this interface: probe what is up now, however idle."""
+    """Probe what is up now, however idle: something other than datagrams gets no answer over this interface."""
 
 
 @dataclass(frozen=True, slots=True)
 class Attend:
-    """Requests go to these peers: whether a path to one of them lives must be known soon, also of those that rest."""
+    """Watch the paths to these peers, also resting ones: requests go there, so whether they live must be known soon."""
 
     peers: frozenset[NodeName]
 
 
 @dataclass(frozen=True, slots=True)
 class SetMtu:
-    """The interface's MTU: bytes, IP header included."""
+    """Set the interface's MTU: bytes, IP header included."""
 
     mtu: int
 
 
 @dataclass(frozen=True, slots=True)
 class Ping:
-    """Somebody on this host wants to know how long a path takes; what comes of it is in `Link.pongs`."""
+    """Measure how long a path takes, for somebody on this host; the result is in `Link.pongs`."""
 
     path: PathId
     number: int
-    """Whose it is; the link only repeats it."""
+    """Names its owner; the link only repeats it."""
     size: int
-    """Of the datagram: bytes of UDP payload, more where a probe does not fit."""
+    """Bytes of the datagram's UDP payload; more if a probe does not fit."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -165,7 +167,7 @@ class SendClose:
 
 
 PathCommand = Send | Resend | SendFinished | SendAbandon | SendForgotten
-"""What is for one path."""
+"""Commands for one path."""
 LinkCommand = (
     SetPeers
     | SetCredential
@@ -188,7 +190,7 @@ class FragmentsReceived(NamedTuple):
 
     path: PathId
     session: SessionId
-    """The peer's: message numbers mean nothing beyond it."""
+    """The peer's session: message numbers mean nothing beyond it."""
     fragments: list[Fragment]
 
 
@@ -247,7 +249,7 @@ class PathChanged:
 
 @dataclass(frozen=True, slots=True)
 class PathMtuChanged:
-    """The longest datagram (bytes of UDP payload) that a path is known to carry; one that goes down forgets it."""
+    """The longest datagram (bytes of UDP payload) that a path is known to carry; a path that goes down forgets it."""
 
     path: PathId
     max_datagram: int
@@ -267,7 +269,7 @@ class PathMeasured:
     missed: int = 0
     """Datagrams found missing while others arrived."""
     policed: bool = False
-    """What was missed so far was a policer's, and ends with the rate at which it was sent."""
+    """A policer caused the losses so far; they end with the sending rate that caused them."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -277,12 +279,12 @@ class PeerRestarted:
     peer: NodeName
     credential: SessionCredential
     at_home: bool
-    """It came from where the peer is known to be."""
+    """Whether it came from where the peer is known to be."""
 
 
 @dataclass(frozen=True, slots=True)
 class PeerRenewed:
-    """As `PeerRestarted`, for the session in use with another certificate."""
+    """As `PeerRestarted`, for the current session with another certificate."""
 
     peer: NodeName
     credential: SessionCredential

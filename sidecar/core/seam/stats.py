@@ -1,7 +1,7 @@
-"""Plain counters that the cores keep and `sidecar/observe/metrics.py` reads at scrape time.
+"""Holds the plain counters that the cores keep and `sidecar/observe/metrics.py` reads at scrape time.
 
-Each object has one writer (a link's thread, or whoever holds the engine); a scrape reads it without a lock, which in
-CPython is safe for ints and dicts as long as the reader copies (`dict(...)`) before it iterates.
+Each object has one writer (a link's thread, or the engine's current holder). A scrape reads it without a lock, which in
+CPython is safe for ints and dicts if the reader copies (`dict(...)`) before it iterates.
 """
 
 from __future__ import annotations
@@ -24,23 +24,23 @@ class PathStats:
     datagrams_sent: int = 0
     datagrams_lost: int = 0
     spurious_losses: int = 0
-    """Of the lost: acknowledged after all."""
+    """Lost datagrams that were acknowledged after all."""
     bytes_sent: int = 0
     max_datagram: int = 0
     """Bytes of UDP payload."""
     key_phase: int = 0
-    """How often the keys that seal what we send have changed."""
+    """Number of changes of the keys that seal what we send."""
 
 
 @dataclass(slots=True)
 class LinkStats:
-    """One interface. Written by its thread only."""
+    """One interface. Only its thread writes it."""
 
     interface: InterfaceName
     datagrams: Counter[tuple[str, str]] = field(default_factory=Counter)
     """(direction: sent | received, kind: data | repair | control | stun); received repair symbols count as data."""
     dropped: Counter[str] = field(default_factory=Counter)
-    """Datagrams by the reason they were dropped for, received and unsendable ones alike."""
+    """Datagrams by reason for the drop, received and unsendable ones alike."""
     bytes: Counter[str] = field(default_factory=Counter)
     """Direction: sent | received; UDP payload bytes."""
     paths: dict[NodeName, PathStats] = field(default_factory=dict)
@@ -53,7 +53,7 @@ class LinkStats:
 
 @dataclass(slots=True)
 class EngineStats:
-    """The requests. Written by whoever holds the engine."""
+    """The requests. Only the engine's current holder writes it."""
 
     requests: Counter[tuple[ServiceName, str]] = field(default_factory=Counter)
     """(service, outcome: ok | deadline_missed | failed | rejected)."""
@@ -62,11 +62,11 @@ class EngineStats:
     wins: Counter[tuple[InterfaceName, NodeName, ServiceName]] = field(default_factory=Counter)
     duplicate_responses: int = 0
     called_off: Counter[tuple[InterfaceName, NodeName, ServiceName]] = field(default_factory=Counter)
-    """Copies no longer awaited since another won."""
+    """Copies no longer awaited because another won."""
     explored: Counter[tuple[InterfaceName, NodeName, ServiceName]] = field(default_factory=Counter)
-    """Copies sent over paths that the mapping does not use, to learn of them."""
+    """Copies sent over paths that the mapping does not use, to measure them."""
     hedged: Counter[tuple[InterfaceName, NodeName, ServiceName]] = field(default_factory=Counter)
-    """Copies sent since another one took long."""
+    """Copies sent because another took long."""
     copy_bytes: Counter[tuple[InterfaceName, ServiceName, str]] = field(default_factory=Counter)
     """(interface, service, copy: first | extra); bytes of messages, see `sidecar.core.robot.dispatch.budgets`."""
     copies_refused: Counter[tuple[InterfaceName, ServiceName, str]] = field(default_factory=Counter)
@@ -79,7 +79,7 @@ class EngineStats:
     revocations: Counter[str] = field(default_factory=Counter)
     """Revocation lists exchanged with peers: asked | sent | received | taken."""
     dropped: Counter[str] = field(default_factory=Counter)
-    """Messages and table entries by the reason they were dropped for."""
+    """Messages and table entries by reason for the drop."""
     mapping_version: int = 0
     peers_version: int = 0
     nacks: int = 0
