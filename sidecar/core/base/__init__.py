@@ -1,1 +1,1 @@
-"""The bottom: identities and reasons that every part speaks, timers, fair shares. Imports nothing of the core."""
+"""Provides the bottom layer: identities and reasons, timers, fair shares. Imports nothing of the core."""

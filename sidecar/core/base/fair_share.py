@@ -1,4 +1,4 @@
-"""Dividing a capped table among peers, so that one that fills it cannot lock the others out."""
+"""Divides a capped table among peers, so that one that fills it cannot lock the others out."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ if TYPE_CHECKING:
     from protos.model.ids import NodeName
 
 FORGOTTEN_AT_ONCE = 128
-"""Old entries that a table forgets in one call, the rest in the next ones: less than a millisecond after any burst."""
+"""Old entries that a table forgets in one call; the rest waits for the next: under a millisecond after any burst."""
 
 
 class Shares:
@@ -26,22 +26,22 @@ class Shares:
         self._held: dict[NodeName, int] = {}
 
     def held(self, peer: NodeName) -> int:
-        """Units that this peer holds."""
+        """Return the units that this peer holds."""
         return self._held.get(peer, 0)
 
     def fits(self, peer: NodeName, units: int = 1) -> bool:
-        """Whether the peer may take this many more."""
+        """Return whether the peer may take this many more."""
         return self.held(peer) + units <= self.capacity - self.used
 
     def take(self, peer: NodeName, units: int = 1) -> None:
-        """The peer takes these units; asking `fits` before is the caller's."""
+        """Give the peer these units; the caller asks `fits` before."""
         if not units:
             return
         self._held[peer] = self.held(peer) + units
         self.used += units
 
     def give_back(self, peer: NodeName, units: int = 1) -> None:
-        """The peer returns units that it took."""
+        """Return units that the peer took."""
         if not units:
             return
         left = self._held[peer] - units

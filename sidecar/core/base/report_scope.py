@@ -1,4 +1,4 @@
-"""What a report is to tell. What is urgent is short, so that a control plane hears a whole fleet soon."""
+"""Says what a report contains. Urgent reports are short, so that a control plane hears a whole fleet soon."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ class ReportScope(enum.Enum):
     """How much of what was measured."""
 
     CHANGES = "changes"
-    """Paths that went up or down since the last report, with what was measured of them. The rest is told when the next
+    """Paths that went up or down since the last report, with what was measured of them. The rest follows when the next
     report is due anyway."""
 
     ALL = "all"

@@ -1,8 +1,8 @@
-"""Identity of a request: 128 bits from the sidecar's session and rmw's writer guid and sequence number.
+"""Derives a request's 128-bit identity from the sidecar's session and rmw's writer guid and sequence number.
 
-Contract: never the service name, never reused. rmw numbers the requests of one client (its writer guid) one by
-one, and the session is drawn afresh at every start, so two different requests never meet in the input; the hash
-only brings the three to 16 bytes (collision chance for 10^9 requests about 10^-21).
+Contract: never the service name, never reused. rmw numbers the requests of one client (its writer guid) one by one, and
+each start draws a new session, so two different requests never have the same input. The hash only brings the three to
+16 bytes (collision chance for 10^9 requests about 10^-21).
 """
 
 from __future__ import annotations
@@ -17,10 +17,11 @@ if TYPE_CHECKING:
 
 REQUEST_ID_BYTES = 16
 OBSERVED_ONE_IN = 8
-"""One request in so many is a full race: no copy is called off because another won, and all are measured.
+"""One request in this many is a full race: no copy is called off because another won, and all are measured.
 
-At 10 requests a second and the estimator's half-life of 60 s, this leaves the weight of 100 requests for each path,
-where its estimate stands on real requests alone; seven eighths of what losers would waste are saved."""
+At 10 requests a second and the estimator's half-life of 60 s, this leaves each path a weight of 100 requests, where its
+estimate rests on real requests alone. It saves seven eighths of what losers would waste.
+"""
 
 
 def make_request_id(session: SessionId, writer_guid: bytes, sequence_number: int) -> RequestId:
@@ -33,9 +34,9 @@ def make_request_id(session: SessionId, writer_guid: bytes, sequence_number: int
 
 
 def is_race(request_id: RequestId) -> bool:
-    """Whether a request is one of those of which all copies are to be measured.
+    """Return whether all copies of a request are to be measured.
 
-    By a hash (the id), so without regard to the outcome, nor in step with anything that the application does every so
-    many requests.
+    The choice is by a hash (the id), so it does not depend on the outcome, and is not in step with anything that the
+    application does every so many requests.
     """
     return request_id[-1] % OBSERVED_ONE_IN == 0

@@ -1,9 +1,9 @@
-"""Work that one event makes for many requests, in slices.
+"""Divides work that one event makes for many requests into slices.
 
-A carrier that goes takes a copy of every request with it, and a server that restarts ends all that it had. To look at
-thousands of requests takes longer than anybody should wait for the engine's lock. So a turn of the engine, which is
-all that it is told at one moment, does no more than a slice of such work. The rest is due at once, at its next timer,
-and between the two whoever waits for the engine has it.
+A lost carrier takes a copy of every request with it, and a restarted server ends all that it had. Looking at thousands
+of requests takes longer than anybody should wait for the engine's lock. So a turn of the engine, which is everything it
+is told at one moment, does at most a slice of such work. The rest is due at once, at its next timer, and between the
+two anyone who waits for the engine gets it.
 """
 
 from __future__ import annotations
@@ -14,18 +14,18 @@ from functools import partial
 from typing import TypeVar
 
 SLICE = 16
-"""Steps in one turn. A step brings one request to another path, among those to fifty servers: up to 0.2 ms."""
+"""Steps in one turn. A step moves one request to another path, chosen among those to fifty servers: up to 0.2 ms."""
 
 GROUP = 16
-"""Light work that counts as one step."""
+"""Pieces of light work that count as one step."""
 
 Target = TypeVar("Target")
 Step = Callable[[float], None]
-"""Does its part; takes the present moment (s)."""
+"""Does its part; takes the current time (s)."""
 
 
 def in_groups(act: Callable[[Target], None], targets: Iterable[Target]) -> list[Step]:
-    """Return steps that do what takes a few microseconds for each of many."""
+    """Return steps that do for many targets what takes a few microseconds each."""
     found = list(targets)
 
     def do(first: int, _now: float) -> None:
@@ -36,11 +36,11 @@ def in_groups(act: Callable[[Target], None], targets: Iterable[Target]) -> list[
 
 
 def rest(_now: float) -> None:
-    """Take a step's time from the turn: what makes the steps looks at many things itself."""
+    """Use up one step of the turn: the job's generator itself looks at many things between steps."""
 
 
 class Backlog:
-    """Jobs, each of many steps; the oldest first."""
+    """Jobs of many steps each; the oldest first."""
 
     __slots__ = ("_jobs", "_left", "_now", "_since", "_unnamed")
 
@@ -52,14 +52,14 @@ class Backlog:
         self._unnamed = 0
 
     def __len__(self) -> int:
-        """Jobs under way."""
+        """Return the number of jobs under way."""
         return len(self._jobs)
 
     def add(self, steps: Callable[[], Iterable[Step]], now: float, name: Hashable = None) -> None:
-        """Do these steps, as many of them now as the turn has room for.
+        """Do these steps, as many now as the turn has room for.
 
-        A job that has the name of one under way begins when that one has ended and all others had their turn, and there
-        is one such job at most: whatever happens meanwhile, nothing is looked at more than twice.
+        A job with the name of one under way begins after that one has ended and all others had their turn. There is at
+        most one such job: whatever happens meanwhile, nothing is looked at more than twice.
         """
         if name is None:
             self._unnamed += 1
@@ -75,12 +75,12 @@ class Backlog:
             self.run(now)
 
     def add_steps(self, steps: list[Step], now: float) -> None:
-        """Do these, if there are any."""
+        """Do these steps, if there are any."""
         if steps:
             self.add(steps.copy, now)
 
     def allows(self, now: float) -> bool:
-        """Whether this turn has room for one more step, which is the caller's then."""
+        """Return whether this turn has room for one more step, and take that step for the caller."""
         if now != self._now:
             self.begin_turn(now)
         if not self._left:
@@ -89,12 +89,12 @@ class Backlog:
         return True
 
     def begin_turn(self, now: float) -> None:
-        """The engine was left and is entered again."""
+        """Begin a turn: the engine was left and is entered again."""
         self._now = now
         self._left = SLICE
 
     def run(self, now: float, leave: int = 0) -> None:
-        """Do what the turn has room for, but for the last `leave` steps."""
+        """Do what the turn has room for, except for the last `leave` steps."""
         while self._jobs and (self._left > leave or now != self._now) and self.allows(now):
             name, job = next(iter(self._jobs.items()))
             step = next(job.steps, None)
@@ -107,7 +107,7 @@ class Backlog:
                 del self._jobs[name]
 
     def next_timer(self) -> float | None:
-        """When `run` is wanted: it has passed if there is work."""
+        """Return when `run` is wanted: in the past if there is work."""
         return self._since if self._jobs else None
 
 

@@ -1,4 +1,4 @@
-"""One timer for each key, the earliest first: a heap whose outdated entries are skipped."""
+"""Keeps one timer for each key, the earliest first, in a heap whose outdated entries are skipped."""
 
 from __future__ import annotations
 
@@ -11,20 +11,20 @@ if TYPE_CHECKING:
     from collections.abc import Container, Hashable
 
 NEVER = math.inf
-"""A moment (s) that does not come."""
+"""A time (s) that never comes."""
 SLACK = 64
-"""Outdated entries that may lie around before they are swept out; beyond it as many as there are live ones."""
+"""Outdated entries kept before a sweep, on top of as many as there are live ones."""
 
 SKIPPED_AT_ONCE = 128
-"""Outdated entries that are dropped in one look at a heap: a fraction of a millisecond."""
+"""Outdated entries dropped in one look at a heap: a fraction of a millisecond."""
 
 K = TypeVar("K", bound="Hashable")
 
 
 def first_of(heap: list[tuple[float, K]], live: Container[K]) -> float | None:
-    """Return when the first timer of a heap is due, having dropped those in front whose key is not among the living.
+    """Drop leading timers whose keys are not live, and return when the first remaining one is due.
 
-    Not more than some of them: after a burst of what is over, that of one which is over may be returned.
+    It drops only SKIPPED_AT_ONCE: after a burst of ended keys it may return the time of an ended one.
     """
     for _ in range(SKIPPED_AT_ONCE):
         if not heap or heap[0][1] in live:
@@ -55,12 +55,12 @@ class Timers(Generic[K]):
                 heapq.heapify(self._heap)
 
     def next(self) -> float | None:
-        """When the earliest timer is due."""
+        """Return when the earliest timer is due."""
         self._skip_outdated()
         return self._heap[0][0] if self._heap else None
 
     def pop_due(self, now: float) -> K | None:
-        """Disarm and return the key whose timer is due for longest; None when none is."""
+        """Disarm and return the key whose timer has been due longest; None if none is."""
         self._skip_outdated()
         if not self._heap or self._heap[0][0] > now:
             return None

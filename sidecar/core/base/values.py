@@ -1,4 +1,4 @@
-"""Values that every part of the core speaks: identities, states, priorities and reasons."""
+"""Defines the values that every part of the core uses: identities, states, priorities and reasons."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ if TYPE_CHECKING:
     from protos.model.ids import InterfaceId, InterfaceName, NodeName
 
 RequestId = NewType("RequestId", bytes)
-"""16 bytes that name one request for ever; see `request_id.py`."""
+"""16 bytes that name one request forever; see `request_id.py`."""
 
 ExecutionId = NewType("ExecutionId", int)
 """Number of one execution on a cloud sidecar, unique within its session."""
@@ -34,9 +34,9 @@ class PathState(enum.Enum):
 
 
 class Priority(enum.IntEnum):
-    """How urgent a service is: what is more urgent goes first, whatever the deadlines.
+    """How urgent a service is: more urgent traffic goes first, whatever the deadlines.
 
-    Smaller is more urgent, so that queues sort by it; the numbers stand on the wire.
+    Smaller is more urgent, so that queues sort by it; the numbers are part of the wire format.
     """
 
     HIGH = 0
@@ -45,11 +45,11 @@ class Priority(enum.IntEnum):
 
 
 SHARE = 16
-"""A waiting lower priority gets one symbol for so many of the higher ones."""
+"""A waiting lower priority gets one symbol for this many of the higher ones."""
 
 
 class RejectReason(enum.IntEnum):
-    """Why a cloud sidecar did not run a request; the numbers stand on the wire."""
+    """Why a cloud sidecar did not run a request; the numbers are part of the wire format."""
 
     NOT_OFFERED = 1
     """No local server for this service."""
@@ -74,10 +74,10 @@ class RejectReason(enum.IntEnum):
 
     @property
     def certainly_not_run(self) -> bool:
-        """True when another server may run the request without breaking at-most-once for it."""
+        """Whether another server may run the request without breaking at-most-once for it."""
         return self not in (RejectReason.SERVER_LOST, RejectReason.FORGOTTEN, RejectReason.TOO_LARGE)
 
     @property
     def may_pass(self) -> bool:
-        """True when the same server may run the request in a moment, or another one that takes its place."""
+        """Whether the same server, or one that takes its place, may run the request in a moment."""
         return self in (RejectReason.NOT_OFFERED, RejectReason.DRAINING)
