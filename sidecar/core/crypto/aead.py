@@ -1,4 +1,4 @@
-"""The ciphers that seal datagrams: authenticated encryption with associated data (RFC 5116), from buffer to buffer."""
+"""Provides the ciphers that seal datagrams: AEAD (RFC 5116), from buffer to buffer."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 KEY_BYTES = 32
 NONCE_BYTES = 12
 TAG_BYTES = 16
-"""The tag stands behind the ciphertext, which is as long as the plaintext."""
+"""The tag follows the ciphertext, which is as long as the plaintext."""
 
 
 class Cipher(Protocol):
@@ -24,7 +24,7 @@ class Cipher(Protocol):
         """Write ciphertext and tag of `data` to `buf`, which may begin where `data` does."""
 
     def decrypt_into(self, nonce: Buffer, data: Buffer, associated_data: Buffer, buf: Buffer, /) -> int:
-        """Write the plaintext to `buf`; raises InvalidTag when `data` is not authentic, and leaves rubbish there."""
+        """Write the plaintext to `buf`; if `data` is not authentic, raise InvalidTag and leave garbage there."""
 
 
 def make_cipher(aead: Aead, key: bytes) -> Cipher:
@@ -33,5 +33,5 @@ def make_cipher(aead: Aead, key: bytes) -> Cipher:
 
 
 def choose(one: Aead, other: Aead) -> Aead:
-    """Return the AEAD of two sidecars that prefer these: AES only where both are quick at it."""
+    """Return the AEAD of two sidecars that prefer these: AES only if both are fast at it."""
     return Aead.AES_256_GCM if one is other is Aead.AES_256_GCM else Aead.CHACHA20_POLY1305

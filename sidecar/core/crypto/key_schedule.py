@@ -1,4 +1,4 @@
-"""From two sessions' keys to the keys of each path and direction. Every step is HKDF with SHA-256 (RFC 5869)::
+"""Derives the keys of each path and direction from two sessions' keys. Every step is HKDF with SHA-256 (RFC 5869)::
 
     pair secret  = HKDF(salt "plr 2 pair", X25519(own key, peer's key), identity of the first | of the second)
     root 0       = Expand(pair secret, "plr 3 path" | the first's interface (8) | the second's interface (8))
@@ -9,11 +9,11 @@
 
 An identity is name, role, session, incarnation, public key and AEAD, as `SessionCredential.identity` lays them out, its
 length (16) before it; role and name put the two in order. Direction is 0 when the first of them sends. E and F are the
-sessions' keys of the end that leads (the robot) and of the other one; e and f are new ones for each phase, of which
-the private halves are forgotten with the exchange (key_exchange.py). So a key belongs to one pair of runs, one pair of
-interfaces, one direction and one phase, both ends agree on all of these or on nothing, who learns all keys of today
-reads nothing of an earlier phase, and who learns one end's session key can not play the other end to it: that takes
-the other's session key as well, as in the Noise pattern IK.
+sessions' keys of the end that leads (the robot) and of the other one; e and f are new ones for each phase, whose
+private halves are forgotten with the exchange (key_exchange.py). So a key belongs to one pair of runs, one pair of
+interfaces, one direction and one phase, and both ends agree on all of these or on nothing. All keys of today open
+nothing of an earlier phase. One end's session key is not enough to impersonate the other end to it: that takes the
+other's session key as well, as in the Noise pattern IK.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ class PairKeys:
     secret: bytes = field(repr=False)
     aead: Aead
     first: bool
-    """Whether we stand first in the order of role and name."""
+    """Whether we come first in the order of role and name."""
     own: X25519PrivateKey = field(repr=False)
     """Our session's key."""
     theirs: X25519PublicKey = field(repr=False)
@@ -80,23 +80,23 @@ def pair_keys(
 
 
 def next_root(root: bytes, shared: bytes, phase: int, leading: bytes, following: bytes) -> bytes:
-    """Return the root of a phase: `shared` is what the three exchanges gave, the others are the new public keys."""
+    """Return the root of a phase: `shared` is the result of the three exchanges, the others are the new public keys."""
     info = _PHASE + phase.to_bytes(4, "big") + leading + following
     return HKDF(SHA256(), KEY_BYTES, salt=root, info=info).derive(shared)
 
 
 def proof_of_offer(root: bytes, phase: int, leading: bytes) -> bytes:
-    """Return what only who knows the root in use can say of a new key for the next phase."""
+    """Return the proof of a new key for the next phase; it takes the current root to make."""
     return expand(root, _OFFER + phase.to_bytes(4, "big") + leading, PROOF_BYTES)
 
 
 def proof(root: bytes) -> bytes:
-    """Return what only who knows a root can say."""
+    """Return the proof of knowing a root."""
     return expand(root, _PROOF, PROOF_BYTES)
 
 
 def expand(secret: bytes, info: bytes, size: int = KEY_BYTES) -> bytes:
-    """HKDF-Expand (RFC 5869 section 2.3)."""
+    """Expand a secret with HKDF-Expand (RFC 5869 section 2.3)."""
     return HKDFExpand(SHA256(), size, info).derive(secret)
 
 

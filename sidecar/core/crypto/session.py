@@ -1,4 +1,4 @@
-"""This run's own key and credential, and the judgement on the peers' credentials."""
+"""Holds this run's own key and credential, and judges the peers' credentials."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from sidecar.core.crypto.key_schedule import PairKeys
 
 MAX_ADMITTED = 8192
-"""Credentials, and signed lists of addresses, whose verification is remembered; beyond it all are verified anew."""
+"""Credentials, and signed lists of addresses, whose verification is remembered; beyond it all are verified again."""
 MAX_CONDEMNED = 1024
 """Sessions refused for what they did; the oldest are forgotten."""
 
@@ -36,12 +36,12 @@ def public_key(private_key: bytes) -> bytes:
 
 
 class OwnSession:
-    """Who we are in this run. Any thread may use it: what is remembered is only ever added to, or dropped."""
+    """Our identity in this run. Any thread may use it: what is remembered is only ever added to, or dropped."""
 
     def __init__(
         self, credential: SessionCredential, private_key: bytes, verify: Callable[[SessionCredential], float]
     ) -> None:
-        """`private_key` belongs to the credential's public key.
+        """Create the session; `private_key` belongs to the credential's public key.
 
         `verify` raises DecodeError for a bad credential, and returns when a good one ends (seconds since 1970).
         """
@@ -49,13 +49,13 @@ class OwnSession:
         self._private_key = X25519PrivateKey.from_private_bytes(private_key)
         self._verify = verify
         self._admitted: dict[bytes, tuple[PairKeys, float]] = {}
-        """What is shared under each credential, and when that ends."""
+        """The keys shared under each credential, and when it ends."""
         self._condemned: dict[SessionId, None] = {}
         self._announced: dict[_Announcement, str] = {}
-        """What is wrong with the signature of each announcement, which whom to trust does not change."""
+        """The fault of each announcement's signature; it does not depend on whom we trust."""
 
     def admit(self, peer: Peer) -> PairKeys:
-        """Return what we share with a peer, having judged its credential: about 0.3 ms, nothing when it is known.
+        """Judge a peer's credential and return the keys we share: about 0.3 ms, nothing if it is known.
 
         Raises:
             DecodeError: the credential is malformed, not of this peer, or refused by `verify`; the text says why.
@@ -90,7 +90,7 @@ class OwnSession:
             self._condemned.pop(next(iter(self._condemned)), None)
 
     def check_candidates(self, peer: Peer) -> bool:
-        """Judge what is told of a peer's addresses: about 0.1 ms, nothing when it is known.
+        """Judge a peer's announced addresses: about 0.1 ms, nothing if they are known.
 
         Returns whether they are signed: in insecure mode nobody signs.
 
@@ -100,7 +100,7 @@ class OwnSession:
         self.admit(peer)
         certificate = decode_credential(peer.credential).certificate
         if not certificate:
-            return False  # otherwise `admit` had refused it
+            return False  # otherwise `admit` would have refused it
         said = certificate, peer.session, peer.candidates_serial, peer.candidates, peer.candidates_signature
         fault = self._announced.get(said)
         if fault is None:
@@ -112,33 +112,33 @@ class OwnSession:
         return True
 
     def has_admitted(self, credential: bytes) -> bool:
-        """Whether this one was judged good: admitting it again costs nothing."""
+        """Return whether this credential was judged good: admitting it again costs nothing."""
         return credential in self._admitted
 
     def ends_at(self, credential: bytes) -> float:
-        """Return when an admitted credential ends (seconds since 1970); that of no other, which is never."""
+        """Return when an admitted credential ends (seconds since 1970); minus infinity for any other."""
         known = self._admitted.get(credential)
         return -math.inf if known is None else known[1]
 
     def forget_ended(self, now_wall: float) -> bool:
-        """Judge those anew that have ended by now (seconds since 1970); False when there are none."""
+        """Forget credentials that ended by now (seconds since 1970), to judge them again; False if there are none."""
         ended = [credential for credential, (_, ends_at) in list(self._admitted.items()) if ends_at < now_wall]
         for credential in ended:
             self._admitted.pop(credential, None)
         return bool(ended)
 
     def renew(self, credential: SessionCredential) -> None:
-        """Take the same credential signed anew, with a renewed certificate.
+        """Take the same credential signed again, with a renewed certificate.
 
         Raises:
-            ValueError: it is of another session.
+            ValueError: it belongs to another session.
         """
         if credential.identity != self.credential.identity:
             raise ValueError("a credential of another session")
         self.credential = credential
 
     def forget_admitted(self) -> None:
-        """Whom to trust has changed: every credential is judged anew when it is seen next."""
+        """Forget all judgements, since whom to trust has changed: each credential is judged again when next seen."""
         self._admitted.clear()
 
 
