@@ -1,1 +1,1 @@
-"""Messages that are not delivered yet, across all paths. Imports `base`, `wire`, `message` and `seam`."""
+"""Keeps undelivered messages, across all paths. Imports `base`, `wire`, `message` and `seam`."""

@@ -1,4 +1,4 @@
-"""Messages on their way in: one reassembler for each peer, and what is to be decoded."""
+"""Receives messages: one reassembler for each peer, and the line of those to be decoded."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 
 class Arrived(NamedTuple):
-    """A message that is whole, and when it is of no use any more."""
+    """A message that is whole, and when it stops being of use."""
 
     content: memoryview
     ends_at: float
@@ -31,17 +31,17 @@ class Inbound:
     """The unfinished messages of all peers."""
 
     def __init__(self, command: Callable[[PathCommand], None], stats: EngineStats, *, answers: bool) -> None:
-        """`answers`: nearly every message is answered, so that what its sender is owed has company before long."""
+        """Create it empty; `answers`: nearly every message is answered, so what its sender is owed soon has company."""
         self._command = command
         self._stats = stats
         self._answers = answers
         self._reassemblers: dict[NodeName, Reassembler] = {}
         self._line = DecodingLine()
         self._untold: dict[NodeName, dict[int, None]] = {}
-        """Finished messages whose peer could not be told for want of a path, oldest first."""
+        """Finished messages whose peer could not be told for lack of a path, oldest first."""
 
     def add(self, path: PathId, session: SessionId, fragments: list[Fragment], now: float) -> list[Arrived]:
-        """Store symbols that came over `path`; returns the messages that they complete."""
+        """Store symbols that came over `path`; return the messages that they complete."""
         reassembler = self._reassemblers.get(path.peer)
         if reassembler is None:
             reassembler = self._reassemblers[path.peer] = Reassembler(path.peer, self._stats.dropped)
@@ -56,7 +56,7 @@ class Inbound:
                 reassembler.forgo(number)
                 self._command(SendForgotten(path, number))
                 continue
-            # Also when it is still to be decoded: nothing that might come could help.
+            # Even if it still has to be decoded: nothing more could help.
             self._command(SendFinished(path, number, at_once=not (self._answers and _is_small(content))))
             if isinstance(content, Partial):
                 self._line.add(Decoding(path, session, content))
@@ -65,7 +65,7 @@ class Inbound:
         return whole
 
     def on_finished_lost(self, peer: NodeName, numbers: tuple[int, ...], best: PathId | None) -> None:
-        """A path died with FINISHED on it: tell the peer over `best`, or once there is a path.
+        """Report FINISHED of a path that died to the peer over `best`, or once there is a path.
 
         Its sender has nothing left to send, and would keep the messages until they expire.
         """
@@ -80,48 +80,48 @@ class Inbound:
             self._stats.dropped["finished_untold"] += 1
 
     def on_path_up(self, path: PathId) -> None:
-        """Tell this peer what it could not be told."""
+        """Report FINISHED of messages to a peer that had no path."""
         for number in self._untold.pop(path.peer, ()):
             self._command(SendFinished(path, number))
 
     def next_decoding(self) -> Decoding | None:
-        """Return the message of which a slice is to be computed next."""
+        """Return the message of which to compute a slice next."""
         return self._line.next()
 
     @property
     def decodings(self) -> int:
-        """How many messages are to be decoded."""
+        """Number of messages to be decoded."""
         return len(self._line)
 
     def forgo_decoding(self, decoding: Decoding) -> None:
-        """It can not be computed."""
+        """Drop a message that cannot be computed."""
         if self._line.done(decoding):
             self._stats.dropped["decoding_failed"] += 1
 
     def take_decoded(self, decoding: Decoding) -> Arrived | None:
-        """It is computed; returns the message, unless its session is over."""
+        """Return a computed message, unless its session is over."""
         if not self._line.done(decoding):
             return None
         return Arrived(decoding.partial.whole(), decoding.partial.ends_at)
 
     def abandon(self, peer: NodeName, number: int) -> None:
-        """The peer does not send the rest of this message."""
+        """Drop this message: the peer does not send the rest."""
         reassembler = self._reassemblers.get(peer)
         if reassembler is not None:
             reassembler.abandon(number)
 
     def forget_peer(self, peer: NodeName) -> None:
-        """The peer's session is over."""
+        """Drop a peer whose session is over."""
         self._reassemblers.pop(peer, None)
         self._stats.dropped["fragment_of_old_session"] += self._line.forget_peer(peer)
         self._untold.pop(peer, None)
 
     def expire(self, now: float) -> None:
-        """Drop messages that wait for too long."""
+        """Drop messages that wait too long."""
         for reassembler in self._reassemblers.values():
             reassembler.expire(now)
 
 
 def _is_small(content: memoryview | Partial | None) -> bool:
-    """Whether a message came whole in one datagram: no symbol of it waits at its sender for FINISHED."""
+    """Return whether a message came whole in one datagram: none of its symbols waits at its sender for FINISHED."""
     return isinstance(content, memoryview) and len(content) <= BASE_SYMBOL_BYTES

@@ -1,4 +1,4 @@
-"""Messages that are not delivered yet, and over which path their missing symbols travel."""
+"""Keeps undelivered messages, and decides over which path their missing symbols travel."""
 
 from __future__ import annotations
 
@@ -26,9 +26,9 @@ if TYPE_CHECKING:
     from sidecar.core.wire.messages import Encoded
 
 LOOKED_AT_ONCE = 512
-"""Messages looked at in one call of `ask_again`, which has the engine's lock: about a millisecond."""
+"""Messages that one call of `ask_again` looks at, under the engine's lock: about a millisecond."""
 MAX_GENERATIONS = 8
-"""How often a message is sent anew under another number; a receiver that forgets it more often is not honest."""
+"""How often a message is sent again under another number. Only a dishonest receiver forgets it more often."""
 
 
 class Outbox:
@@ -43,12 +43,12 @@ class Outbox:
         self._parked: dict[NodeName, dict[int, OutboundMessage]] = {}
         self._room = Room()
         self._answers: dict[tuple[NodeName, RequestId], list[OutboundMessage]] = {}
-        """Undelivered answers by the robot and request they are for: one for each copy that asked."""
+        """Undelivered answers by robot and request: one for each copy that asked."""
         self._answers_over: list[tuple[NodeName, RequestId]] = []
-        """Those of which the last message ended since it was asked; what is cut anew begins again."""
+        """Keys whose last message ended since `take_answers_over`; a message that is cut again starts over."""
         self._made_room = False
         self._looked_at = 0
-        """How many of the messages, oldest first, `ask_again` has looked at in this round."""
+        """Number of messages, oldest first, that `ask_again` has looked at in this round."""
         self._next_number = 1
 
     def __len__(self) -> int:
@@ -60,37 +60,37 @@ class Outbox:
         return self._room.held_bytes
 
     def messages_to(self, peer: NodeName) -> int:
-        """How many messages to this peer are undelivered."""
+        """Return the number of undelivered messages to this peer."""
         return self._room.messages_to(peer)
 
     def sent_over(self, path: PathId) -> int:
-        """Bytes of the undelivered messages that were first sent over this path."""
+        """Return the bytes of undelivered messages first sent over this path."""
         return self._room.sent_over(path)
 
     def waiting_over(self, interface: InterfaceName) -> int:
-        """How many undelivered messages use this interface."""
+        """Return the number of undelivered messages that use this interface."""
         return sum(interface in message.interfaces for message in self._messages.values())
 
     def has_room(self, peer: NodeName, size: int) -> bool:
-        """Whether another message of this size may be sent to this peer."""
+        """Return whether another message of this size may be sent to this peer."""
         return self._room.fits(peer, size)
 
     def take_made_room(self) -> bool:
-        """Whether a message ended since the last call, so that what waits for room may find it."""
+        """Return whether a message ended since the last call, so that what waits for room may find it."""
         made, self._made_room = self._made_room, False
         return made
 
     def take_answers_over(self) -> list[tuple[NodeName, RequestId]]:
-        """Return the robots and requests whose answers are under way no more, delivered or not."""
+        """Return the robots and requests whose answers are no longer under way, delivered or not."""
         over, self._answers_over = self._answers_over, []
         return [key for key in over if key not in self._answers]
 
     def carries_answer(self, peer: NodeName, request: RequestId) -> bool:
-        """Whether an answer to this request is under way."""
+        """Return whether an answer to this request is under way."""
         return (peer, request) in self._answers
 
     def answer_has_begun(self, peer: NodeName, request: RequestId) -> bool:
-        """Whether anything may have left of an answer that is under way."""
+        """Return whether some of an answer that is under way may have left."""
         return any(message.begun for message in self._answers.get((peer, request), ()))
 
     def send(
@@ -106,12 +106,12 @@ class Outbox:
         copy_of: RequestId | None = None,
         siblings: list[OutboundMessage] | None = None,
     ) -> OutboundMessage | None:
-        """Send a message over `path`; None (counted) when there is no room.
+        """Send a message over `path`; return None (counted) if there is no room.
 
-        `fec`: repair symbols for each source symbol, None: by the path's loss; none at all where they find no room.
+        `fec`: repair symbols for each source symbol, None: by the path's loss; none at all if they find no room.
         `answers`: the request that it answers, by which `drop_answers` finds it.
         `copy_of`: the request that it is a copy of.
-        `siblings`: what carries the same request already; it becomes one of them.
+        `siblings`: the messages that already carry the same request; it joins them.
         """
         if not self.has_room(path.peer, content.size):
             self._stats.dropped["outbox_full"] += 1
@@ -154,7 +154,7 @@ class Outbox:
             self._send_copies(message, message.path, (message.count - 1,))
 
     def on_finished(self, peer: NodeName, number: int) -> OutboundMessage | None:
-        """The peer holds all of it. None when it is not one of the peer's messages, or was over before."""
+        """Remove a message that the peer holds; None if it is not one of the peer's messages, or was already over."""
         message = self._messages.get(number)
         if message is None or message.peer != peer:
             return None
@@ -162,11 +162,11 @@ class Outbox:
         return message
 
     def on_answered(self, message: OutboundMessage) -> None:
-        """The peer proved by its answer that it holds all of it, also when its FINISHED got lost."""
+        """Remove a message whose answer proves that the peer holds it, even if its FINISHED got lost."""
         self._remove(message.newest)
 
     def on_forgotten(self, peer: NodeName, number: int) -> None:
-        """The peer dropped what it had of the message: the whole of it travels anew."""
+        """Send a message again from the beginning, since the peer dropped what it had of it."""
         message = self._messages.get(number)
         if message is None or message.peer != peer:
             return
@@ -176,7 +176,7 @@ class Outbox:
             self._enter_anew(message, self._routes.best_to(peer) or message.path)
 
     def drop(self, message: OutboundMessage) -> None:
-        """Nothing more of it needs to travel, as whatever it was cut into. A peer that has some of it is told so."""
+        """Stop sending a message, in whatever it was cut into, and tell a peer that has some of it."""
         message = message.newest
         unfinished = message.begun and not message.over and message.count > 1
         self._remove(message)
@@ -199,7 +199,7 @@ class Outbox:
                 self._forget_answer((message.peer, message.answers), message)
 
     def drop_answers(self, peer: NodeName, request: RequestId) -> None:
-        """The peer called this request off: what is unsent of its answers stays here."""
+        """Keep back what is unsent of the answers to this request, which the peer called off."""
         for message in self._answers.get((peer, request), ())[:]:
             self.drop(message)
 
@@ -211,7 +211,7 @@ class Outbox:
             self._answers_over.append(key)
 
     def drop_peer(self, peer: NodeName) -> list[Step]:
-        """The peer's session is over: what was meant for it cannot arrive. Returns what is left to do."""
+        """Drop what was meant for a peer whose session is over. Return the remaining steps."""
         messages = self._by_peer.pop(peer, {}).values()
         for message in messages:
             message.over = True
@@ -252,7 +252,7 @@ class Outbox:
         self._command(Resend(path, message, indices))
 
     def _cut_anew(self, message: OutboundMessage, path: PathId) -> None:
-        """No path carries its symbols any more: the whole of it travels again, in smaller ones."""
+        """Send the whole message again in smaller symbols: no path carries its present ones any more."""
         self.drop(message)
         self._enter_anew(message, path)
 
@@ -260,13 +260,13 @@ class Outbox:
         self._enter(message.cut_anew(self._take_number(), path, self._routes.symbol_to(path.peer)))
 
     def on_path_up(self, path: PathId) -> list[Step]:
-        """Return what sends all that waited for a path to this peer."""
+        """Return the steps that send all that waited for a path to this peer."""
         return [partial(self._send_rest, message) for message in self._parked.pop(path.peer, {}).values()]
 
     def on_interface_gone(self, interface: InterfaceName) -> list[Step]:
-        """The interface's link is gone with all it had queued: returns what gives its messages other paths.
+        """Return the steps that move messages off an interface whose link is gone, with all it had queued.
 
-        What of them is on its way over another interface travels twice; nobody knows any more which it is.
+        Their symbols in flight over another interface travel twice; nobody knows any more which those are.
         """
         messages = [message for message in self._messages.values() if interface in message.interfaces]
         for message in messages:
@@ -274,14 +274,14 @@ class Outbox:
         return [partial(self._send_rest, message) for message in messages]
 
     def _send_rest(self, message: OutboundMessage, now: float) -> None:
-        """Send all that is missing of a message, whatever of it is under way."""
+        """Send all that is missing of a message, even if in flight."""
         self.on_lost(FragmentsLost(message.path, message, message.give_up()), now)
 
     def ask_again(self) -> None:
-        """Ask after messages that the peer has all of, as far as is known, but has not reported FINISHED.
+        """Ask about messages that the peer seems to have in full, but has not reported FINISHED.
 
-        That report is lost if the interface went that it waited for, say. One symbol that comes once more brings it.
-        To be called about once a second: what is found so twice is asked after.
+        That report gets lost if the interface on which it waited goes, for example. One symbol sent once more brings
+        it. Call this about once a second: a message found so twice is asked about.
         """
         start = self._looked_at
         messages = list(islice(self._messages.values(), start, start + LOOKED_AT_ONCE))
@@ -296,7 +296,7 @@ class Outbox:
                 self._resend(message, path, (0,))
 
     def expired(self, now: float) -> list[Step]:
-        """Return what drops the messages whose time is over."""
+        """Return the steps that drop expired messages."""
         return in_groups(self._expire, [message for message in self._messages.values() if message.expires <= now])
 
     def _expire(self, message: OutboundMessage) -> None:

@@ -1,8 +1,8 @@
-"""How much may be under way to one peer: what it can put together, and how many messages.
+"""Limits what may be under way to one peer: by what it can reassemble, and by the number of messages.
 
-A peer puts unfinished messages together in MAX_PEER_BYTES (`reassembly.py`), each copy of a payload in a buffer of its
-own. Large messages and small ones have parts of it that are theirs alone: neither waits for the other, however many
-there are. A message of one datagram is never unfinished, so only its number counts.
+A peer reassembles unfinished messages in MAX_PEER_BYTES (`reassembly.py`), each copy of a payload in its own buffer.
+Large and small messages each have a part of it to themselves: neither waits for the other, however many there are. A
+message of one datagram is never unfinished, so only its number counts.
 """
 
 from __future__ import annotations
@@ -19,13 +19,13 @@ if TYPE_CHECKING:
     from sidecar.core.message.outbound import OutboundMessage
 
 MAX_MESSAGES = 16_384
-"""All undelivered messages: one peer may have half of them, as many as requests may be in flight."""
+"""All undelivered messages; one peer may have half of them, as many as requests may be in flight."""
 SMALL_BYTES = 256 * 1024
 """The longest message that counts as small: a camera's image does."""
 SMALL_ROOM_BYTES = 16 * 1024 * 1024
 """Undelivered small messages to one peer: what 1 Gbit/s carries in 130 ms."""
 LARGE_ROOM_BYTES = 48 * 1024 * 1024
-"""Undelivered larger messages to one peer: three of 16 MB. With the small ones: what it can put together."""
+"""Undelivered larger messages to one peer: three of 16 MB. With the small ones it is what a peer can reassemble."""
 
 
 class Lane(enum.IntEnum):
@@ -37,7 +37,7 @@ class Lane(enum.IntEnum):
 
     @classmethod
     def of(cls, size: int) -> Lane:
-        """Where a message of `size` bytes belongs."""
+        """Return the lane of a message of `size` bytes."""
         if size <= BASE_SYMBOL_BYTES:
             return cls.DATAGRAM
         return cls.SMALL if size <= SMALL_BYTES else cls.LARGE
@@ -47,7 +47,7 @@ _ROOM_BYTES = {Lane.SMALL: SMALL_ROOM_BYTES, Lane.LARGE: LARGE_ROOM_BYTES}
 
 
 class Room:
-    """What each peer's undelivered messages hold."""
+    """Room that each peer's undelivered messages take."""
 
     __slots__ = ("_held", "_messages", "_over", "held_bytes")
 
@@ -59,15 +59,15 @@ class Room:
         """Bytes of all undelivered messages."""
 
     def messages_to(self, peer: NodeName) -> int:
-        """How many messages to this peer are undelivered."""
+        """Return the number of undelivered messages to this peer."""
         return self._messages.held(peer)
 
     def sent_over(self, path: PathId) -> int:
-        """Bytes of the undelivered messages that were first sent over this path."""
+        """Return the bytes of undelivered messages first sent over this path."""
         return self._over.get(path, 0)
 
     def fits(self, peer: NodeName, size: int, held: int | None = None) -> bool:
-        """Whether there is room for a message of `size` bytes, which holds `held` with its repair symbols."""
+        """Return whether a message of `size` bytes fits, which holds `held` with its repair symbols."""
         if not self._messages.fits(peer):
             return False
         lane = Lane.of(size)
@@ -76,12 +76,12 @@ class Room:
         return self._held.get((peer, lane), 0) + (size if held is None else held) <= _ROOM_BYTES[lane]
 
     def take(self, message: OutboundMessage) -> None:
-        """The message is under way; asking `fits` before is the caller's."""
+        """Take the room of a message under way; the caller asks `fits` before."""
         self._messages.take(message.peer)
         self._add(message, message.held_bytes)
 
     def give_back(self, message: OutboundMessage) -> None:
-        """The message that took it is over."""
+        """Give back the room of a message that is over."""
         self._messages.give_back(message.peer)
         self._add(message, -message.held_bytes)
 

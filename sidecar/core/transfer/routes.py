@@ -1,4 +1,4 @@
-"""The paths as the engine knows them: which are up, how fast, and which to take."""
+"""Tracks the paths as the engine knows them: which are up, how fast, and which to take."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class Route:
     """Bytes of UDP payload."""
     estimate: LossEstimate = field(default_factory=LossEstimate)
     order: tuple[int, float, PathId] = field(init=False)
-    """Sorts the better path first; kept ready, as every request asks for that of every path."""
+    """Sort key, better paths first. It is precomputed, as every request asks for it on every path."""
 
     def __post_init__(self) -> None:
         self._set_order()
@@ -61,7 +61,7 @@ class Routes:
         self._reached: set[NodeName] = set()
         self._counts: dict[InterfaceName, Counter[PathState]] = {}
         self.best: Mapping[InterfaceName, PathState] = {}
-        """The best state of the paths over each of our interfaces that has some; another object when one changes."""
+        """The best path state over each of our interfaces with paths; replaced by a new object on each change."""
 
     def set_state(self, path: PathId, state: PathState) -> None:
         """Note a path's liveness."""
@@ -77,7 +77,7 @@ class Routes:
             self._reached.discard(peer)
 
     def set_max_datagram(self, path: PathId, size: int) -> None:
-        """Note how long a path's datagrams may be, in bytes of UDP payload."""
+        """Note the longest datagram of a path, in bytes of UDP payload."""
         self._get(path).max_datagram = size
 
     def set_rtt(self, path: PathId, smoothed_rtt_s: float) -> None:
@@ -85,14 +85,14 @@ class Routes:
         self._get(path).set_rtt(smoothed_rtt_s)
 
     def rtt(self, path: PathId) -> float:
-        """Return a path's smoothed round-trip time in seconds, 0 while none is known."""
+        """Return a path's smoothed round-trip time in seconds, 0 while unknown."""
         route = self._routes.get(path)
         return 0.0 if route is None else route.smoothed_rtt_s
 
     def note_fates(self, path: PathId, arrived: int, missed: int, *, policed: bool = False) -> None:
         """Note how many of a path's datagrams arrived and were missed since the last call.
 
-        `policed`: what was lost until now says nothing of what the path loses from now on.
+        `policed`: past losses say nothing of what the path loses from now on.
         """
         route = self._get(path)
         if policed:
@@ -101,7 +101,7 @@ class Routes:
             route.estimate.add(arrived, missed)
 
     def loss(self, path: PathId) -> Loss:
-        """Return what to expect the path to lose."""
+        """Return the loss to expect of the path."""
         route = self._routes.get(path)
         return Loss() if route is None else route.estimate.loss
 
@@ -114,7 +114,7 @@ class Routes:
         return route
 
     def _count(self, path: PathId, before: PathState | None, after: PathState | None) -> None:
-        """A path's state is another; None: there is no such path."""
+        """Count a path's change of state; None: there is no such path."""
         interface = path.interface
         counts = self._counts.setdefault(interface, Counter())
         if before is not None:
@@ -127,13 +127,13 @@ class Routes:
             self.best = others if best is None else others | {interface: best}
 
     def forget_peer(self, peer: NodeName) -> None:
-        """The peer is not to be talked to any more."""
+        """Forget a peer that is no longer to be talked to."""
         for path in self._by_peer.pop(peer, {}):
             self._count(path, self._routes.pop(path).state, None)
         self._reached.discard(peer)
 
     def forget_interface(self, interface: InterfaceName) -> list[PathId]:
-        """The interface is gone; returns the paths it had."""
+        """Forget an interface that is gone; return its paths."""
         paths = [path for path in self._routes if path.interface == interface]
         for path in paths:
             self._count(path, self._routes.pop(path).state, None)
@@ -147,19 +147,19 @@ class Routes:
         return PathState.DOWN if route is None else route.state
 
     def reaches(self, peer: NodeName) -> bool:
-        """Whether any path to the peer is not down."""
+        """Return whether any path to the peer is not down."""
         return peer in self._reached
 
     def reached(self) -> list[NodeName]:
-        """Return the peers to which any path is not down."""
+        """Return the peers with a path that is not down."""
         return list(self._reached)
 
     def reaches_any(self, peers: Iterable[NodeName]) -> bool:
-        """Whether any path to any of these peers is not down."""
+        """Return whether any path to any of these peers is not down."""
         return not self._reached.isdisjoint(peers)
 
     def dark(self, peers: Iterable[NodeName]) -> tuple[InterfaceName, ...]:
-        """Return our interfaces over which there are paths to these peers, but none that is up."""
+        """Return our interfaces with paths to these peers of which none is up."""
         up: dict[InterfaceName, bool] = {}
         for peer in peers:
             for path, route in self._by_peer.get(peer, {}).items():
@@ -199,7 +199,7 @@ class Routes:
     def best_to(self, peer: NodeName, avoid: PathId | None = None, size: int = 0) -> PathId | None:
         """Return the best path to the peer that is not down, preferably one that carries datagrams of `size` bytes.
 
-        `avoid` is taken only when there is no other, or when it is up and the others carry less than `size`.
+        `avoid` is taken only if there is no other, or if it is up and the others carry less than `size`.
         """
 
         def reluctance(route: Route) -> int:
@@ -215,7 +215,7 @@ class Routes:
         return None if best is None else best.id
 
     def beside(self, path: PathId, size: int) -> PathId | None:
-        """Return another path to the same peer that is up, carries `size` bytes and is not much slower, the best."""
+        """Return the best other path to the same peer that is up, carries `size` bytes and is not much slower."""
         slowest = 2.0 * self._get(path).smoothed_rtt_s
         others = [
             route
@@ -229,12 +229,12 @@ class Routes:
         return None if best is None else best.id
 
     def max_datagram(self, path: PathId) -> int:
-        """Return how long the path's datagrams may be, in bytes of UDP payload."""
+        """Return the longest datagram of the path, in bytes of UDP payload."""
         route = self._routes.get(path)
         return BASE_BYTES if route is None else route.max_datagram
 
     def symbol_to(self, peer: NodeName) -> int:
-        """Return the symbol size (bytes) that every path to the peer carries which is not down."""
+        """Return the symbol size (bytes) that every path to the peer carries, except those that are down."""
         routes = self._by_peer.get(peer, {}).values()
         sizes = (route.max_datagram for route in routes if route.state is not PathState.DOWN)
         return min(sizes, default=BASE_BYTES) - FRAGMENT_OVERHEAD_BYTES

@@ -1,8 +1,8 @@
-"""What waits for room, and who is next.
+"""Orders what waits for room, and decides who is next.
 
-Urgent before bulk, and within a priority those in time before late ones, earliest deadline first. What is next keeps
-its turn while it does not fit: a large one gets the room that smaller ones would else take again and again. No priority
-starves: while a lower one waits, it gets one byte in SHARE.
+Urgent before bulk; within a priority, those in time before late ones, earliest deadline first. The next one keeps its
+turn while it does not fit: a large one gets the room that smaller ones would otherwise take again and again. No
+priority starves: while a lower one waits, it gets one byte in SHARE.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ else:
     Key = TypeVar("Key")
 
 SLACK = 64
-"""Places in line of what is over that may lie around before they are swept out."""
+"""Outdated places in line that may remain before a sweep."""
 
 
 class _Place(NamedTuple):
@@ -32,13 +32,13 @@ class _Place(NamedTuple):
 
 
 class _Class(Generic[Key]):
-    """Those of one priority."""
+    """The keys of one priority."""
 
     __slots__ = ("fresh", "late", "passed_over", "waiting")
 
     def __init__(self) -> None:
         self.fresh: list[tuple[float, int, Key]] = []
-        """Heaps by deadline, with what is over and has not come up yet."""
+        """Heaps by deadline; ended keys that have not come up yet remain in them."""
         self.late: list[tuple[float, int, Key]] = []
         self.waiting = 0
         self.passed_over = 0
@@ -46,7 +46,7 @@ class _Class(Generic[Key]):
 
 
 class WaitingLine(Generic[Key]):
-    """Keys of what waits for the same room; how many there are at most is their owner's business."""
+    """Keys of what waits for the same room. Their owner limits their number."""
 
     __slots__ = ("_classes", "_order", "_places")
 
@@ -59,7 +59,7 @@ class WaitingLine(Generic[Key]):
         return len(self._places)
 
     def add(self, key: Key, priority: Priority, deadline: float, size: int) -> None:
-        """It waits from now on; it must not wait already."""
+        """Add a key that is not waiting yet."""
         place = self._places[key] = _Place(priority, deadline, next(self._order), size)
         mine = self._classes[priority]
         mine.waiting += 1
@@ -70,7 +70,7 @@ class WaitingLine(Generic[Key]):
                 heapq.heapify(heap)
 
     def first(self, now: float) -> Key | None:
-        """Return the one whose turn it is; None when nobody waits."""
+        """Return the key whose turn it is; None if none waits."""
         heads = [(each, key) for each in self._classes if (key := self._head(each, now)) is not None]
         for lower, key in reversed(heads[1:]):
             if lower.passed_over >= SHARE * self._places[key].size:
@@ -96,7 +96,7 @@ class WaitingLine(Generic[Key]):
         return place is not None and place.order == item[1]
 
     def went(self, key: Key) -> None:
-        """It had its turn and found room."""
+        """Remove a key that had its turn and found room."""
         place = self._places[key]
         self.remove(key)
         self._classes[place.priority].passed_over = 0
@@ -105,7 +105,7 @@ class WaitingLine(Generic[Key]):
                 lower.passed_over += place.size
 
     def remove(self, key: Key) -> None:
-        """It waits no more, or never did."""
+        """Remove a key, if it waits."""
         place = self._places.pop(key, None)
         if place is not None:
             mine = self._classes[place.priority]
