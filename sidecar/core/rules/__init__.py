@@ -1,1 +1,1 @@
-"""What the configuration says of services and of what copies may cost. Imports `base` and `message`."""
+"""Represents the configuration's rules for services and budgets for copies. Imports `base` and `message`."""

@@ -1,4 +1,4 @@
-"""What the configuration lets extra copies cost on an interface."""
+"""Limits what extra copies may cost on an interface, by the configuration."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True, slots=True)
 class Budget:
-    """The limits of the interfaces whose name matches `pattern` (exact or glob); each has its own."""
+    """The limits of the interfaces whose name matches `pattern` (exact or glob); each interface has its own."""
 
     pattern: str
     extra_load: float | None = None
@@ -17,5 +17,5 @@ class Budget:
 
     @property
     def limits(self) -> bool:
-        """Whether it has any limit."""
+        """Whether there is any limit."""
         return self.extra_load is not None or self.extra_bytes_a_day is not None

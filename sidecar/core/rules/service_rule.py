@@ -1,7 +1,7 @@
-"""Says which services are carried, and how: the configuration's rules, matched by name.
+"""Decides which services are carried, and how: by the configuration's rules, matched by name.
 
 The first rule that matches wins. The fallback of a rule is never carried itself. Parameter and lifecycle services of
-nodes are carried only when a rule names them exactly: a glob such as /* must not open every node's parameters to other
+nodes are carried only if a rule names them exactly: a glob such as /* must not open every node's parameters to other
 machines.
 """
 
@@ -30,16 +30,16 @@ class FallbackRule:
     service: ServiceName
     """A service of the same type that a node on this robot serves; never carried itself."""
     in_time: bool = True
-    """Ask it so early that it answers by the deadline; else when the network has missed."""
+    """Ask it early enough to answer by the deadline; else only once the network has missed."""
     takes_s: float | None = None
-    """How long it takes, at most; None: as measured."""
+    """Longest time that it takes; None: as measured."""
 
 
 MAX_LIFETIME_S = 300.0
-"""A request that may wait longer is a job, not a call; a server remembers every request for longer than this."""
+"""A request that may wait longer is a job, not a call. A server remembers every request for longer than this."""
 
 MAX_FOUND = 8192
-"""Names whose rule is kept ready; all are searched for again when a further one comes."""
+"""Names whose rule is cached; one more empties the cache."""
 
 _GLOB_CHARACTERS = frozenset("*?[")
 _NODE_INTERNAL_SUFFIXES = frozenset(
@@ -73,39 +73,39 @@ class ServiceRule:
     idempotent: bool = False
     """Copies of one request may run on several servers."""
     type: str = ""
-    """Robot: the type that servers have to offer it with; empty: that of most of them."""
+    """Robot: the type that servers must offer; empty: the type that most of them offer."""
     drop_late: bool = False
     """A response after the deadline is not delivered."""
     priority: Priority = Priority.NORMAL
-    """Whose messages and executions go first where something waits."""
+    """Which messages and executions go first where something waits."""
     fec: Redundancy = None
-    """Repair symbols for each source symbol of the messages that are sent from here; None: by the measured loss."""
+    """Repair symbols for each source symbol of messages sent from here; None: by the measured loss."""
     redundancy: RedundancyMode = RedundancyMode.REPLICATE
     """Robot: which of the mapped pairs carry a copy, and when."""
     hedge_quantile: float = DEFAULT_HEDGE_QUANTILE
     """Robot, with RedundancyMode.HEDGE: the share of first copies that is waited for."""
     adaptive_target: float = DEFAULT_ADAPTIVE_TARGET
-    """Robot, with RedundancyMode.ADAPTIVE: the probability to miss the deadline that further copies are to keep."""
+    """Robot, with RedundancyMode.ADAPTIVE: the probability of a deadline miss that further copies are to keep."""
     copies: Copies = EVERY_INTERFACE
     """Robot: how many copies of a request the control plane may map."""
     target_miss: float = 0.0
-    """Robot: above 0, the cheapest mapping is wanted that misses no more often; 0: the most reliable one."""
+    """Robot: above 0, the cheapest mapping that misses at most this often is wanted; 0: the most reliable one."""
     wanted_miss: float = 0.0
-    """Robot: the share of misses that the configuration allows, whatever is done about it; 0: it names none."""
+    """Robot: the share of misses that the configuration allows, whatever is done about it; 0: none named."""
     exploration: float = 0.0
     """Robot: at most this share of the requests gets one more copy over a path that the mapping does not use."""
     fallback: FallbackRule | None = None
-    """Robot: what answers here when the network does not; `pattern` is a name then."""
+    """Robot: what answers here when the network does not; `pattern` is then a name."""
     capacity: int = 0
-    """Cloud: how many robot interfaces may be mapped here; 0 means no limit."""
+    """Cloud: number of robot interfaces that may be mapped here; 0 means no limit."""
     charge: float = 0.0
-    """Cloud: what a request costs that runs here."""
+    """Cloud: cost of a request that runs here."""
 
 
 class Rules:
     """The configuration's rules in their order, asked by name.
 
-    A node asks about the same names again and again, for every request and every peer's offers: what is found is kept.
+    A node asks about the same names again and again, for every request and every peer's offers, so results are cached.
     """
 
     __slots__ = ("_exact", "_fallbacks", "_found", "_globs")
@@ -123,13 +123,13 @@ class Rules:
                 self._fallbacks.add(rule.fallback.service)
 
     def find(self, name: ServiceName) -> ServiceRule | None:
-        """Return the rule under which the service is carried, or None when it is not."""
+        """Return the rule under which the service is carried, or None if it is not."""
         try:
             return self._found[name]
         except KeyError:
             pass
         if len(self._found) >= MAX_FOUND:
-            self._found.clear()  # peers name services: whoever invents names costs time, not memory
+            self._found.clear()  # peers name services: inventing names costs time, not memory
         found = self._found[name] = self._search(name)
         return found
 
