@@ -1,7 +1,7 @@
-"""Quantiles of Beta distributions, of many at once.
+"""Computes quantiles of many Beta distributions at once.
 
-The distribution function is the regularised incomplete beta function, by its continued fraction (DLMF 8.17.22) with
-the modified method of Lentz; the quantile is where it takes the wanted value, found by Newton's method within a bracket
+The distribution function is the regularised incomplete beta function, by its continued fraction (DLMF 8.17.22) with the
+modified method of Lentz. The quantile is where it takes the wanted value, found by Newton's method within a bracket
 that shrinks at every step.
 """
 
@@ -22,20 +22,20 @@ if TYPE_CHECKING:
     Floats = NDArray[np.float64]
 
 STEPS = 60
-"""Halvings of [0, 1] after which nothing a person reads changes; Newton's method needs a few."""
+"""Halvings of [0, 1] after which no visible digit changes; Newton's method needs a few."""
 
 TERMS = 400
-"""Of the continued fraction: some multiple of the square root of a distribution's weight is enough."""
+"""Terms of the continued fraction; some multiple of the square root of a distribution's weight is enough."""
 
 _TINY = 1e-300
 _log_gamma = np.vectorize(math.lgamma, otypes=[np.float64])
 
 
 def intervals(estimates: Sequence[Estimate], level: float) -> list[tuple[float, float]]:
-    """Of each estimate the interval that holds it with probability `level`, with as much left over each side.
+    """Return for each estimate the interval that holds it with probability `level`, with equal tails.
 
-    Where fewer than one miss, or hit, is behind an estimate, its Beta distribution is all but one point at 0, or 1. The
-    interval then goes as far as n trials leave open that brought none, to 3 / n for 90 % (the rule of three).
+    With fewer than one miss, or hit, behind an estimate, its Beta distribution is all but one point at 0, or 1. The
+    interval then reaches as far as n trials without a miss, or hit, leave open: 3 / n for 90 % (the rule of three).
     """
     if not estimates:
         return []
@@ -45,12 +45,12 @@ def intervals(estimates: Sequence[Estimate], level: float) -> list[tuple[float, 
     open_end = ((1.0 - level) / 2.0) ** (1.0 / (misses + hits))
     low = np.where(hits < 1.0, np.minimum(low, open_end), low)
     high = np.where(misses < 1.0, np.maximum(high, 1.0 - open_end), high)
-    # Both may be 0 within rounding, and then in any order.
+    # Within rounding both may be 0, and then in any order.
     return list(zip(low.tolist(), np.maximum(low, high).tolist(), strict=True))
 
 
 def quantiles(a: Floats, b: Floats, share: float) -> Floats:
-    """Of each Beta(a, b) the value below which `share` of it lies, within 1e-12."""
+    """Return for each Beta(a, b) the value below which `share` of it lies, within 1e-12."""
     log_norm = _log_gamma(a + b) - _log_gamma(a) - _log_gamma(b)
     low, high = np.zeros_like(a), np.ones_like(a)
     at = a / (a + b)
@@ -72,7 +72,7 @@ def quantiles(a: Floats, b: Floats, share: float) -> Floats:
 
 
 def _below(a: Floats, b: Floats, at: Floats, log_norm: Floats) -> Floats:
-    """The share of each Beta(a, b) below `at`."""
+    """Return the share of each Beta(a, b) below `at`."""
     with np.errstate(divide="ignore"):
         front = np.exp(log_norm + a * np.log(at) + b * np.log1p(-at))
     # The fraction converges fast on this side of the mean; the other side is its mirror image.

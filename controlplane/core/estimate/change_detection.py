@@ -1,10 +1,9 @@
-"""Notices that a server's times are not what they were, within a few answers.
+"""Detects within a few answers that a server's times have changed.
 
-A memory of a minute takes a minute to follow, and one of a few seconds knows a steady server badly. So what is new is
-held against the whole memory: is it more likely under that, or as the beginning of something else, of which nothing is
-expected but that it stays as it began (Polya's urn)? Sums of the logarithms of this ratio that do not fall back to 0
-tell a change and when it began (CUSUM, Page 1954). What was measured before it is then forgotten, of times as of
-outcomes.
+A memory of a minute takes a minute to follow, and one of a few seconds knows a steady server badly. So new samples are
+held against the whole memory: are they more likely under it, or as the beginning of something else, of which nothing is
+expected but that it stays as it began (Polya's urn)? Sums of the log-likelihood ratio that do not fall back to 0 reveal
+a change and when it began (CUSUM, Page 1954). Everything measured before it, times and outcomes, is then forgotten.
 """
 
 from __future__ import annotations
@@ -26,35 +25,35 @@ _PER_BIN = round(math.log(2.0) / math.log(GROWTH))
 
 _FIRST = np.arange(0, BUCKETS, _PER_BIN)
 _BINS = len(_FIRST) + 1
-"""With one for the lost."""
+"""Number of bins, including one for the lost."""
 
 PRIOR_SAMPLES = 2.0
-"""Of each kind that are taken for granted, evenly, beside what was measured: who was hardly measured hardly changes."""
+"""Pseudo-count spread evenly over the bins beside what was measured: a server hardly measured hardly changes."""
 
 NEW_PRIOR_SAMPLES = 1.0
-"""The same for what may have begun: its second sample is as likely like the first as anything."""
+"""The same for what may have begun: its second sample is as likely to resemble the first as anything."""
 
 MAX_EVIDENCE = 2.5
-"""No single sample says more: a server that once took long may have done so by chance, three times in a row not."""
+"""Upper limit for one sample: a server that once took long may have done so by chance, but not three times in a row."""
 
 ENOUGH_EVIDENCE = 6.0
-"""A logarithm: a change is some hundred times as likely."""
+"""Logarithm of the likelihood ratio that is enough: a change is a few hundred times as likely."""
 
 LEAST_S = 0.4
-"""A change lasts at least as long; all that waited behind one hiccup of a server is a single event."""
+"""Minimum duration of a change; everything that waited behind one hiccup of a server is a single event."""
 
 NEIGHBOURS_SHARE = 0.15
-"""Of what is expected of a bin, of the next faster and of the next slower one each: times spread."""
+"""Share of a bin's expectation that goes to each of the next faster and the next slower bin: times spread."""
 
 DRIFT = 0.3
-"""Taken off for each sample, so that what goes on as usual does not look like something that begins."""
+"""Subtracted for each sample, so that business as usual does not look like a beginning."""
 
 USUAL_SHARE = 0.2
-"""Nothing new begins with a sample where so many of those before it took half to twice as long."""
+"""Nothing new begins with a sample if this share of those before it took half to twice as long."""
 
 
 class ChangeWatch:
-    """Holds new samples against a memory of old ones; the memory is the caller's. Times are monotonic seconds."""
+    """Holds new samples against the caller's memory of old ones. Times are monotonic seconds."""
 
     __slots__ = ("_began", "_evidence", "_since", "accused")
 
@@ -67,7 +66,7 @@ class ChangeWatch:
 
     @property
     def suspects(self) -> bool:
-        """Whether the last samples were odd, but too few yet to tell a change."""
+        """Whether the last samples were odd, but too few yet to show a change."""
         return self._since is not None
 
     def add(
@@ -75,7 +74,7 @@ class ChangeWatch:
     ) -> Histogram | None:
         """Judge new samples by what is known without them, of which a share of `kept` still counts.
 
-        What came since the change if there was one, else None; it is `settled` then, or `doubted`.
+        Return what came since the change if there was one, else None. The caller then calls `settled` or `doubted`.
         """
         self.accused = False
         if self._since is None and _is_usual(new, known, known_lost, kept):
@@ -100,11 +99,11 @@ class ChangeWatch:
         return self._since
 
     def settled(self) -> None:
-        """The change is taken note of."""
+        """Note that the change has been taken into account."""
         self._evidence, self._since = 0.0, None
 
     def doubted(self) -> None:
-        """The change is not believed yet: more of the same says no more than this did."""
+        """Note that the change is not believed yet: more of the same says no more than this did."""
         self._evidence = ENOUGH_EVIDENCE
 
 
@@ -117,7 +116,7 @@ def _is_usual(new: Histogram, known: NDArray[np.float64], known_lost: float, kep
 
 
 def _log_begun(counts: NDArray[np.float64], since: Histogram | None) -> float:
-    """Logarithm of the probability of these samples, one by one, where others began."""
+    """Return the log-probability of these samples, one by one, given those since the change began."""
     begun = _smooth(since.counts, since.lost) if since is not None else np.zeros(_BINS)
     prior = NEW_PRIOR_SAMPLES / _BINS
     total = float(begun.sum()) + NEW_PRIOR_SAMPLES

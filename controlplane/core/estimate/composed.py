@@ -1,4 +1,4 @@
-"""How likely a request misses its deadline on a path, put together from what the network takes and the server needs."""
+"""Estimates how likely a request misses its deadline on a path, from what the network takes and the server needs."""
 
 from __future__ import annotations
 
@@ -16,20 +16,20 @@ if TYPE_CHECKING:
     from protos.model.ids import InterfaceName, NodeName
 
 MODEL_REQUESTS = 5.0
-"""What an estimate from parts (network and processing) is worth in real requests of the very service ..."""
+"""Worth of an estimate from parts (network and processing), in real requests of the very service ..."""
 
 SHARED_REQUESTS = 15.0
-"""... and at most more, if the path carried other services' requests of the same size ..."""
+"""... and at most this much more if the path carried other services' requests of the same size ..."""
 
 STRANGE_SERVER_REQUESTS = 2.0
-"""... but at most this, if the server's own processing times are not known yet."""
+"""... but at most this if the server's own processing times are not known yet."""
 
 MODEL_MAX_SAMPLES = 100.0
-"""Probes or requests beyond which more of them do not bring the estimate from parts any nearer to 0 or 1."""
+"""Probes or requests beyond which more of them do not bring the estimate from parts nearer to 0 or 1."""
 
 
 class Asked(NamedTuple):
-    """Which requests, over which path."""
+    """Which requests to estimate, over which path."""
 
     interface: InterfaceName
     server: NodeName
@@ -39,11 +39,11 @@ class Asked(NamedTuple):
 
 
 Parts = list[tuple[float, "list[tuple[Witness, float]]"]]
-"""For each size class the share of the requests, and who tells what of them: that a request misses is so probable."""
+"""For each size class its share of the requests, and each witness with the miss probability it tells."""
 
 
 def parts_of(asked: Asked, network: RobotNetwork, processing: ServerTimes, now: float) -> Parts:
-    """Ask all who tell of the path, with what the server needs."""
+    """Ask all witnesses of the path, given what the server needs."""
     times, deadline_s = processing.times, asked.deadline_s
     return [
         (
@@ -58,10 +58,10 @@ def parts_of(asked: Asked, network: RobotNetwork, processing: ServerTimes, now: 
 
 
 def from_parts(parts: Parts, carried: float, known_requests: float) -> Estimate:
-    """P(network + processing > deadline), as known without the requests that were carried.
+    """Return P(network + processing > deadline), without the requests that the path carried itself.
 
-    `carried` are the requests on this very path whose outcomes are counted elsewhere, `known_requests` those from which
-    it is known what the server needs. `IGNORANCE` where nothing is known of the network.
+    `carried` counts the requests on this very path whose outcomes are counted elsewhere, `known_requests` those that
+    the server's times rest on. Return `IGNORANCE` if nothing is known of the network.
     """
     miss = samples = shared = 0.0
     for share, told in parts:
@@ -90,7 +90,7 @@ def from_parts(parts: Parts, carried: float, known_requests: float) -> Estimate:
 def slower_than(
     asked: Asked, network: RobotNetwork, processing: ServerTimes, seconds: NDArray[np.float64], now: float
 ) -> NDArray[np.float64] | None:
-    """P(network + processing > s) for each s, as measured; None where nothing is known of the network."""
+    """Return P(network + processing > s) for each s, as measured; None if nothing is known of the network."""
     slower = np.zeros(len(seconds))
     for size_class, share in asked.sizes:
         missed = np.zeros(len(seconds))

@@ -1,4 +1,4 @@
-"""Distributions of latencies over the buckets of `protos.base.histogram`, and how likely the sum of two is too slow."""
+"""Represents distributions of latencies in the buckets of `protos.base.histogram`, and how likely a sum is too slow."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ if TYPE_CHECKING:
 _LOWER_EDGES = np.concatenate(([0.0], EDGES))
 _MIDS = np.array(MIDS)
 _ROUNDING = 1e-9
-"""What sums of probabilities may be off by: half of the samples is half, whatever was added in between."""
+"""Possible error in sums of probabilities: half of the samples is half, whatever was added in between."""
 
 
 class Distribution:
-    """Probabilities of the buckets; what is left to 1 is that there never is an answer. Times are seconds.
+    """Probabilities of the buckets; the rest to 1 is the probability of no answer. Times are seconds.
 
-    Only the buckets from the first to the last that may be in use are kept, and nothing of them changes.
+    It is immutable and keeps only the buckets from the first to the last that may be in use.
     """
 
     __slots__ = ("_first", "_mass", "_used", "never", "tail")
@@ -29,16 +29,16 @@ class Distribution:
     def __init__(self, first: int, mass: NDArray[np.float64], tail: NDArray[np.float64]) -> None:
         self._first = first
         self._mass = mass
-        """From that bucket on."""
+        """Probabilities from that bucket on."""
         self.tail = tail
-        """For each of these buckets, and the next one, if there is one, the probability of more than its lower edge."""
+        """For each of these buckets, and the next one if there is one, the probability of more than its lower edge."""
         self.never = max(0.0, float(tail[-1] - mass[-1]) if first + len(mass) == BUCKETS else float(tail[-1]))
         """Probability of no answer."""
         self._used: tuple[NDArray[np.float64], NDArray[np.float64]] | None = None
 
     @classmethod
     def of(cls, mass: NDArray[np.float64], never: float, *, first: int = 0) -> Distribution:
-        """From the probabilities of buckets, from the `first` on, and that of no answer, which together are 1."""
+        """Make it from the probabilities of buckets, from `first` on, and that of no answer, which together are 1."""
         tail = np.empty(min(len(mass) + 1, BUCKETS - first))
         tail[-1] = 0.0
         np.cumsum(mass[::-1], out=tail[len(mass) - 1 :: -1])
@@ -47,14 +47,14 @@ class Distribution:
 
     @classmethod
     def mixed(cls, first: Distribution, share: float, second: Distribution) -> Distribution:
-        """`first` with probability `share`, else `second`."""
+        """Return the mixture: `first` with probability `share`, else `second`."""
         start = min(first._first, second._first)
         end = max(first._first + len(first._mass), second._first + len(second._mass))
         (mass, tail), (other_mass, other_tail) = first._within(start, end), second._within(start, end)
         return cls(start, share * mass + (1.0 - share) * other_mass, share * tail + (1.0 - share) * other_tail)
 
     def _within(self, start: int, end: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Mass and tail of more buckets."""
+        """Return mass and tail over a larger range of buckets."""
         mass = np.zeros(end - start)
         tail = np.full(min(end + 1, BUCKETS) - start, self.tail[-1])
         before = self._first - start
@@ -77,38 +77,39 @@ class Distribution:
         return self._used
 
     def median(self) -> float:
-        """Median within 2 %; inf if an answer is less likely than none."""
+        """Return the median within 2 %; inf if an answer is less likely than none."""
         slower = (self.tail <= 0.5 + _ROUNDING).nonzero()[0]
         index = int(slower[0]) + self._first - 1 if slower.size else BUCKETS - 1
         return MIDS[index] if index < BUCKETS - 1 or self.never <= 0.5 + _ROUNDING else math.inf
 
     def over(self, seconds: NDArray[np.float64]) -> NDArray[np.float64]:
-        """P(X > s) for each s, linear inside a bucket; the overflow bucket is over whatever there is."""
+        """Return P(X > s) for each s, linear inside a bucket; the overflow bucket exceeds every s."""
         over = self._between(seconds)
         over[seconds >= MAX_S] = self.tail[-1]
         over[seconds < 0.0] = 1.0
         return over
 
     def _between(self, seconds: NDArray[np.float64]) -> NDArray[np.float64]:
-        """The same for 0 <= s < MAX_S."""
+        """Return the same for 0 <= s < MAX_S."""
         tail = self.tail
         over: NDArray[np.float64] = np.interp(seconds, _LOWER_EDGES[self._first : self._first + len(tail)], tail)
         return over
 
     def sum_exceeds(self, other: Distribution | None, seconds: float) -> float:
-        """P(A + B > seconds) for an A of this distribution and a B of the other, independent; B is 0 without one."""
+        """Return P(A + B > seconds) for independent A of this and B of the other distribution; without other, B is
+        0."""
         if other is None:
             return float(self.over(np.array([seconds]))[0])
         mass, took = self.used
         if not len(took):
             return self.never
         left = seconds - took
-        # The longest is left beside the shortest time.
+        # The shortest time leaves the most.
         usual = left[0] < MAX_S and left[-1] >= 0.0
         return float(mass @ (other._between(left) if usual else other.over(left))) + self.never
 
     def sums_exceed(self, other: Distribution | None, seconds: NDArray[np.float64]) -> NDArray[np.float64]:
-        """The same for each of some times."""
+        """Return the same for each of several times."""
         if other is None:
             return self.over(seconds)
         mass, took = self.used

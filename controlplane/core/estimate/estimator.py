@@ -1,9 +1,8 @@
-"""Probability that a request misses its deadline, for every (robot, interface, server, service), and how much more
+"""Estimates how likely a request misses its deadline, for every (robot, interface, server, service), and how much more
 often than by chance two of a robot's paths miss together.
 
-Requests of the service that really ran are the best witness. For pairs that carried few or none, what the network
-takes (`network`) and what the server needs (`processing`) are put together.
-What is computed, and why: docs/develop/theory.md.
+Requests of the service that really ran are the best witness. For pairs that carried few or none, what the network takes
+(`network`) and what the server needs (`processing`) are combined. Method and reasons: docs/develop/theory.md.
 """
 
 from __future__ import annotations
@@ -47,47 +46,47 @@ K = TypeVar("K")
 V = TypeVar("V")
 
 CHANGE_MATTERS = 0.1
-"""A pair's outcomes are those of another server if, by its parts, the server's change moves its miss probability so
+"""A pair's outcomes are those of another server if, by its parts, the server's change moves its miss probability this
 far."""
 
 CHANGE_KEEPS_REQUESTS = 1.0
-"""As many of them still count then."""
+"""How many of these outcomes still count then."""
 
 USUAL_SIZE_SHARE = 0.1
-"""Size classes that make up less of a service's requests are left out of its estimate."""
+"""Share of a service's requests below which a size class is left out of its estimate."""
 
 INDEPENDENCE_REQUESTS = 20.0
-"""What the belief that paths fail independently is worth in requests sent over both."""
+"""Worth of the belief that paths fail independently, in requests sent over both."""
 
 MAX_PAIRS_PER_ROBOT = 1024
-"""Pairs of one robot whose missed deadlines are kept by service, the least recently reported goes: 4 interfaces, 16
-servers, 16 services."""
+"""Pairs of one robot whose missed deadlines are kept by service: 4 interfaces, 16 servers, 16 services. The least
+recently reported one is evicted."""
 
 MAX_JOINTS_PER_ROBOT = 1024
-"""Pairs of paths of one robot whose common misses are kept, the least recently reported goes."""
+"""Pairs of paths of one robot whose common misses are kept; the least recently reported one is evicted."""
 
 MAX_FATES_PER_ROBOT = 1024
 """Pairs of interfaces of one robot whose common misses are kept, by service and, for copies to one server, by server;
-the least recently reported goes."""
+the least recently reported one is evicted."""
 
 MAX_OUTCOMES_PER_ROBOT = 1024
-"""Services kept of one robot, the least recently reported goes: as many as it can carry."""
+"""Services kept of one robot, as many as it can carry; the least recently reported one is evicted."""
 
 MAX_HISTOGRAMS = 131_072
-"""Histograms kept of all robots: 4,096 robots with 3 interfaces and 5 servers need 122,880. Beyond that, robots are
-forgotten that have not reported for `LIVE_S`, the longest silent first; where there are none, robots that have their
-equal share get no new ones. So nobody who reports loses what another one brings."""
+"""Histograms kept of all robots: 4,096 robots with 3 interfaces and 5 servers need 122,880. Beyond that, robots that
+have not reported for `LIVE_S` are forgotten, the longest silent first. If there are none, robots that have their equal
+share get no new ones. So no robot that reports loses what another one brings."""
 
 MAX_ROBOTS = 8192
-"""Robots kept, those gone for a while among them: twice as many as may be registered."""
+"""Robots kept, including some that left: twice as many as may be registered."""
 
 LIVE_S = 60.0
-"""A robot that has reported within this time is not forgotten for another one: several of the longest intervals."""
+"""A robot that reported within this time is not forgotten for another one: several of the longest intervals."""
 
 
 @dataclass(frozen=True, slots=True)
 class Evidence:
-    """What an estimate rests on; histograms count `protos.model.explanation.SAMPLE` for a sample that has not faded."""
+    """What an estimate rests on; in the histograms, an unfaded sample counts `protos.model.explanation.SAMPLE`."""
 
     requests: float
     probes: float
@@ -95,13 +94,13 @@ class Evidence:
     network: Histogram
     compute: Histogram
     witnesses: int
-    """Robots that said what the server needs."""
+    """Number of robots that reported what the server needs."""
     busiest: tuple[NodeName, float] | None
-    """Whose word counts for most, and for what share."""
+    """The robot whose word counts for most, and its share."""
 
 
 class _Service:
-    """What one robot's requests of a service are like, and how long they have been heard of."""
+    """Sizes of one robot's requests of a service, and how long these have been heard of."""
 
     __slots__ = ("clock", "sizes")
 
@@ -111,7 +110,7 @@ class _Service:
 
 
 class _Outcomes:
-    """What became of one robot's requests of a service: lately, and in all since this is kept."""
+    """What became of one robot's requests of a service: recently, and in total since this is kept."""
 
     __slots__ = ("faded", "missed", "requests")
 
@@ -122,7 +121,7 @@ class _Outcomes:
 
 
 class _Pair:
-    """Requests of a service over a path, and how often its server had changed when that was looked at last."""
+    """Requests of a service over a path, and how often its server had changed when last checked."""
 
     __slots__ = ("changes", "trials")
 
@@ -161,13 +160,13 @@ class _Robot:
         self.late: OrderedDict[ServiceName, LateFate] = OrderedDict()
         self.penalties = Penalties()
         self.troubles: dict[tuple[ServiceName, float, InterfaceName], InterfaceTrouble] = {}
-        """Worked out, by service, deadline and interface ..."""
+        """Computed, by service, deadline and interface ..."""
         self.troubles_at = (0, 0.0)
-        """... from so many reports of all robots, at this time."""
+        """... from this many reports of all robots, at this time."""
 
 
 def _usual_sizes(tables: _Robot, service: ServiceName) -> tuple[tuple[int, float], ...]:
-    """(size class, share) of the service's requests; the smallest class as long as there were none."""
+    """Return (size class, share) of the service's requests; the smallest class until there are any."""
     of_service = tables.services.get(service)
     return tuple(of_service.sizes.shares(USUAL_SIZE_SHARE)) if of_service is not None else ((0, 1.0),)
 
@@ -183,12 +182,12 @@ class Estimator:
         self._dropped = 0
         self._reports = 0
         self._times: dict[tuple[NodeName, ServiceName], ServerTimes] = {}
-        """Worked out ..."""
+        """Computed ..."""
         self._parts: dict[tuple[ServiceName, Asked], Parts] = {}
-        """... as well as what there is to tell of each path of this robot ..."""
+        """... like what there is to tell of each path of this robot ..."""
         self._worked_out_of: _Robot | None = None
         self._worked_out_at = (0, 0.0)
-        """... from so many reports, at this time."""
+        """... from this many reports, at this time."""
 
     @property
     def dropped(self) -> int:
@@ -196,8 +195,8 @@ class Estimator:
         return self._dropped + self._compute.dropped
 
     def merge(self, robot: NodeName, report: Report, now: float) -> bool:
-        """Add a report; True if a path went up or down with it, or is reported for the first time, or if a server needs
-        other times than before, or is penalised or is so no more."""
+        """Add a report. Return True if a path went up or down or is new, if a server needs other times than before, or
+        if the set of penalised servers changed."""
         self._reports += not report.continues
         tables = self._robots.get(robot)
         if tables is None:
@@ -235,7 +234,7 @@ class Estimator:
         return changed
 
     def _forget_old(self, tables: _Robot, now: float) -> None:
-        """Robots, and paths of this robot, that nobody has reported on for long: most of them never come back."""
+        """Forget robots, and paths of this robot, that nobody has reported on for long: most never come back."""
         since = now - forget_after_s(self._half_life_s)
         tables.network.forget_before(since)
         forget_before(tables.trials, since, lambda pair: pair.trials.at)
@@ -249,7 +248,7 @@ class Estimator:
             self._histograms -= len(oldest.network)
 
     def _forget_silent(self, robot: NodeName, now: float) -> None:
-        """Make room for this robot's report, as far as there are robots that have been silent for long."""
+        """Make room for this robot's report by forgetting robots that have been silent for long, if any."""
         while self._histograms >= MAX_HISTOGRAMS or len(self._robots) > MAX_ROBOTS:
             name, silent = next(iter(self._robots.items()))
             if name == robot or now - silent.heard_at < LIVE_S:
@@ -290,7 +289,7 @@ class Estimator:
         together.add(joint.requests, joint.both_missed, now)
 
     def _keep(self, table: OrderedDict[K, V], key: K, value: V, limit: int) -> None:
-        """Put it in, as used last, and evict the least recently used beyond `limit`."""
+        """Insert the value as most recently used, and evict the least recently used one beyond `limit`."""
         table[key] = value
         table.move_to_end(key)
         if len(table) > limit:
@@ -298,47 +297,47 @@ class Estimator:
             self._dropped += 1
 
     def forget_paths(self, robot: NodeName) -> None:
-        """The robot is gone or was started anew: whether its paths are up is not known any more."""
+        """Forget whether the robot's paths are up: it is gone or has restarted."""
         tables = self._robots.get(robot)
         if tables is not None:
             self._histograms -= len(tables.network)
             tables.network.forget_paths()
-            # It may send copies in another way from now on.
+            # It may send copies in another way now.
             tables.late.clear()
             self._worked_out_of = None
             self._histograms += len(tables.network)
 
     def paths(self, robot: NodeName) -> Iterator[PathReport]:
-        """The last report of each path of a robot."""
+        """Yield the last report of each path of a robot."""
         tables = self._robots.get(robot)
         if tables is not None:
             yield from (state.last for state in tables.network.paths.values())
 
     def path_states(self, robot: NodeName) -> Mapping[tuple[InterfaceName, NodeName], PathState]:
-        """What is known of each path of a robot: the table itself, which `forget_paths` leaves to who holds it."""
+        """Return what is known of each path of a robot: the table itself, which `forget_paths` leaves to its holder."""
         tables = self._robots.get(robot)
         return tables.network.paths if tables is not None else {}
 
     def path_views(self, robot: NodeName) -> Iterator[PathView]:
-        """Each path of a robot as reported last, with its round trips as remembered."""
+        """Yield each path of a robot as last reported, with its remembered round trips."""
         tables = self._robots.get(robot)
         if tables is not None:
             for key, state in tables.network.paths.items():
                 yield PathView(*key, state.up, state.rtt.median_once(), tables.network.leads_there(key))
 
     def path_up(self, robot: NodeName, interface: InterfaceName, server: NodeName) -> bool | None:
-        """Whether the path was up when last reported; None if it never was reported."""
+        """Return whether the path was up when last reported; None if it was never reported."""
         tables = self._robots.get(robot)
         state = tables.network.paths.get((interface, server)) if tables is not None else None
         return state.up if state is not None else None
 
     def penalties(self, robot: NodeName, now: float) -> Mapping[NodeName, PenaltyReport]:
-        """Servers that the robot asks only where it has no other, as their answers could not be delivered."""
+        """Return the servers that the robot asks only as a last resort, as their answers could not be delivered."""
         tables = self._robots.get(robot)
         return tables.penalties.in_force(now) if tables is not None else {}
 
     def observed_miss_ratio(self, robot: NodeName, service: ServiceName, now: float) -> float | None:
-        """Share of the robot's recent requests that missed their deadline or failed; None without any."""
+        """Return the share of the robot's recent requests that missed their deadline or failed; None without any."""
         tables = self._robots.get(robot)
         count = tables.outcomes.get(service) if tables is not None else None
         if count is None or count.faded.weight(now) < IGNORANCE.misses:
@@ -346,8 +345,8 @@ class Estimator:
         return count.faded.ratio()
 
     def counted(self, robot: NodeName, service: ServiceName) -> tuple[int, int]:
-        """The robot's requests that ended, and those of them that missed their deadline or failed; they begin at 0
-        again when the robot is not heard of for long."""
+        """Return how many of the robot's requests ended, and how many of these missed their deadline or failed. Both
+        restart at 0 after the robot has not been heard of for long."""
         tables = self._robots.get(robot)
         count = tables.outcomes.get(service) if tables is not None else None
         return (count.requests, count.missed) if count is not None else (0, 0)
@@ -361,10 +360,10 @@ class Estimator:
         deadline_s: float,
         now: float,
     ) -> Estimate:
-        """epsilon_ij = P(L_ij > deadline), as the posterior of the requests that ran on this pair.
+        """Return epsilon_ij = P(L_ij > deadline), as the posterior of the requests that ran on this pair.
 
-        The prior is put together from network and processing times, `IGNORANCE` where nothing is known of the network,
-        and moved by the trouble that requests to other servers met over the interface.
+        The prior combines network and processing times, or is `IGNORANCE` if nothing is known of the network. It is
+        moved by the trouble that requests to other servers met over the interface.
         """
         tables = self._robots.get(robot)
         if tables is None:
@@ -387,13 +386,13 @@ class Estimator:
         return pair.trials.posterior(trouble.moved(prior, interface, server), now)
 
     def carried(self, robot: NodeName, pair: Pair, now: float) -> float:
-        """Requests of the service that were measured over this pair, as far as they count still."""
+        """Return how many requests of the service were measured over this pair, as far as they still count."""
         tables = self._robots.get(robot)
         found = tables.trials.get(pair) if tables is not None else None
         return found.trials.counts(now)[0] if found is not None else 0.0
 
     def late_fate(self, robot: NodeName, service: ServiceName, now: float) -> tuple[float, float]:
-        """First copies that missed and requests that missed, see `LateFate.counts`."""
+        """Return how many first copies and how many requests missed, see `LateFate.counts`."""
         tables = self._robots.get(robot)
         found = tables.late.get(service) if tables is not None else None
         return found.counts(now) if found is not None else (0.0, 0.0)
@@ -401,9 +400,9 @@ class Estimator:
     def slower_than(
         self, robot: NodeName, pair: Pair, seconds: NDArray[np.float64], now: float
     ) -> NDArray[np.float64] | None:
-        """How likely an answer over this pair takes longer than each of some times, by what network and server took.
+        """Return how likely an answer over this pair takes longer than each time, by network and processing times.
 
-        None where nothing is known of the network.
+        Return None if nothing is known of the network.
         """
         tables = self._robots.get(robot)
         if tables is None:
@@ -413,7 +412,7 @@ class Estimator:
         return slower_than(asked, tables.network, self._compute.times(server, service, now), seconds, now)
 
     def _begin(self, tables: _Robot, now: float) -> None:
-        """What was worked out from other reports, for another time or robot, counts no more."""
+        """Discard what was computed from other reports, or for another time or robot."""
         at = (self._reports, now)
         if self._worked_out_at != at:
             self._worked_out_at = at
@@ -444,7 +443,7 @@ class Estimator:
     def _trouble(
         self, tables: _Robot, service: ServiceName, deadline_s: float, wanted: InterfaceName, now: float
     ) -> InterfaceTrouble:
-        """What the robot's requests of the service met over this interface beyond what their parts explain."""
+        """Return what the robot's requests of the service met over this interface beyond what their parts explain."""
         trouble = tables.troubles.get((service, deadline_s, wanted))
         if trouble is None:
             trouble = tables.troubles[service, deadline_s, wanted] = InterfaceTrouble()
@@ -452,7 +451,7 @@ class Estimator:
             for (interface, server, of), pair in tables.trials.items():
                 if interface != wanted:
                     continue
-                # Outcomes that may be those of a server which changed, or changes now, say nothing of the interface.
+                # Outcomes of a server that changed, or may be changing now, say nothing of the interface.
                 if of != service or pair.changes != self._compute.changes(server, service)[0]:
                     continue
                 if self._compute.is_odd(server, service):
@@ -466,9 +465,9 @@ class Estimator:
     def evidence(
         self, robot: NodeName, path: Assignment, service: ServiceName, now: float, *, servers_now: float | None = None
     ) -> Evidence:
-        """What was measured on this pair, for the operator.
+        """Return what was measured on this pair, for the operator.
 
-        Of a robot that is gone `now` is when it went; of its servers others tell since, until `servers_now`.
+        For a robot that is gone, `now` is when it left; others report on its servers since, until `servers_now`.
         """
         servers_now = now if servers_now is None else servers_now
         tables = self._robots.get(robot) or _Robot(self._half_life_s)
@@ -490,14 +489,14 @@ class Estimator:
     def common_misses(
         self, robot: NodeName, service: ServiceName, now: float
     ) -> Iterator[tuple[InterfaceName, InterfaceName, NodeName | None, CommonMisses]]:
-        """The pairs of interfaces that carried copies of the same requests: to that server, or if None to two."""
+        """Yield the pairs of interfaces that carried copies of the same requests: to that server, or if None to two."""
         tables = self._robots.get(robot)
         for (of, first, second, server), fate in tables.fates.items() if tables is not None else ():
             if of == service and (found := fate.common_misses(now)) is not None:
                 yield first, second, server, found
 
     def raced_together(self, robot: NodeName, service: ServiceName) -> Iterator[tuple[Assignment, Assignment]]:
-        """The pairs of paths that carried copies of the same requests."""
+        """Yield the pairs of paths that carried copies of the same requests."""
         tables = self._robots.get(robot)
         if tables is not None:
             yield from ((first, second) for of, first, second in tables.joints if of == service)
@@ -505,9 +504,9 @@ class Estimator:
     def both_miss(
         self, robot: NodeName, service: ServiceName, first: Assignment, second: Assignment, product: float, now: float
     ) -> Estimate:
-        """P(requests over both paths miss on both), where `product` is that probability if they fail independently.
+        """Return P(requests over both paths miss on both); `product` is that probability if they fail independently.
 
-        `first` comes before `second` in the order of their names. Without common requests it is the product.
+        `first` comes before `second` in the order of their names. Without common requests the result is the product.
         """
         prior = Estimate.of(product, INDEPENDENCE_REQUESTS)
         tables = self._robots.get(robot)

@@ -1,6 +1,6 @@
 """Keeps histograms and counts that forget: every sample's weight halves with each half-life.
 
-Tables of them forget as well: names of robots and servers come and go without end, and must not all be kept.
+Tables of them forget as well: names of robots and servers come and go without end, and not all can be kept.
 """
 
 from __future__ import annotations
@@ -28,11 +28,11 @@ if TYPE_CHECKING:
     from controlplane.core.estimate.staleness import HeardClock
 
 _FORGOTTEN = 1e-9
-"""Samples that together weigh less are none: a few steps on, floats run out of range."""
+"""Samples that together weigh less count as none: soon after, floats run out of range."""
 
 
 class FadedCount:
-    """A pair of counts, events and those among them that went wrong, fading with a half-life in seconds."""
+    """A pair of counts, events and those of them that went wrong, fading with a half-life in seconds."""
 
     __slots__ = ("_all", "_at", "_bad", "_half_life_s")
 
@@ -44,7 +44,7 @@ class FadedCount:
 
     @property
     def at(self) -> float:
-        """When something was added last."""
+        """When something was last added."""
         return self._at
 
     def add(self, total: float, bad: float, now: float) -> None:
@@ -55,20 +55,20 @@ class FadedCount:
         self._bad = self._bad * factor + bad
 
     def weight(self, now: float) -> float:
-        """How many events it is worth by now."""
+        """Return how many events it is worth by now."""
         return self._all * math.exp2((self._at - now) / self._half_life_s)
 
     def rank(self) -> float:
-        """Of counts with the same half-life the one of higher rank is worth more events, at any time."""
+        """Return the rank: of counts with the same half-life, the higher one is worth more events at any time."""
         return math.log2(self._all) + self._at / self._half_life_s if self._all else -math.inf
 
     def ratio(self) -> float:
-        """Share of the wrong ones; NaN without events."""
+        """Return the share of the wrong ones; NaN without events."""
         return self._bad / self._all if self._all else math.nan
 
 
 class FadedShares:
-    """How often each of a few kinds came lately, numbered from 0; fading with a half-life in seconds."""
+    """How often each of a few kinds, numbered from 0, came recently; fading with a half-life in seconds."""
 
     __slots__ = ("_at", "_counts", "_half_life_s")
 
@@ -79,7 +79,7 @@ class FadedShares:
 
     @property
     def at(self) -> float:
-        """When something was added last."""
+        """When something was last added."""
         return self._at
 
     def add(self, kind: int, count: float, now: float) -> None:
@@ -90,7 +90,7 @@ class FadedShares:
         self._counts[kind] += count
 
     def shares(self, least: float) -> list[tuple[int, float]]:
-        """(kind, share) of those that make up at least `least` of all; their shares sum up to 1."""
+        """Return (kind, share) of those that make up at least `least` of all; their shares sum to 1."""
         counts = self._counts
         limit = least * sum(counts)
         common = [(kind, count) for kind, count in enumerate(counts) if count and count >= limit]
@@ -99,10 +99,10 @@ class FadedShares:
 
 
 class FadedHistogram:
-    """Weights by bucket of `protos.base.histogram`, and of the lost, fading with a half-life in seconds.
+    """Weights of the buckets of `protos.base.histogram` and of the lost, fading with a half-life in seconds.
 
-    Samples that were called off count for as long as they lasted: `distribution` follows Kaplan and Meier. With the
-    clock of its like they fade faster while only these are heard of.
+    Called-off samples count for as long as they lasted: `distribution` follows Kaplan and Meier. With the clock of its
+    group, a histogram fades faster while only others of the group are heard of.
     """
 
     __slots__ = (
@@ -114,10 +114,10 @@ class FadedHistogram:
         self._silence = Silence(clock)
         self._half_life_s = half_life_s
         self._at = now
-        # Most histograms use a few dozen buckets side by side; all of a fleet's would not stay in a processor's cache.
+        # Most histograms use a few dozen adjacent buckets; all buckets of a fleet would not fit a processor's cache.
         self._first = BUCKETS
         self._values = array("d")
-        """Weights from the first bucket in use to the last: one is counted up as in a list of Python's ..."""
+        """Weights from the first bucket in use to the last: counting one up is as cheap as in a Python list ..."""
         self._counts: NDArray[np.float64] = np.zeros(0)
         """... and numpy computes on the same memory."""
         self._called_off: NDArray[np.float64] | None = None
@@ -128,11 +128,11 @@ class FadedHistogram:
 
     @property
     def at(self) -> float:
-        """When something was added last."""
+        """When something was last added."""
         return self._at
 
     def add(self, histogram: Histogram, now: float, called_off: Histogram | None = None) -> None:
-        """Merge new samples, and of those called off when they were."""
+        """Merge new samples, and those called off, by when they were."""
         factor = math.exp2((self._at - now) / self._half_life_s) * self._silence.end()
         self._at = now
         indices, counts = histogram.sparse
@@ -156,7 +156,7 @@ class FadedHistogram:
         self._distribution = self._answered = None
 
     def _make_room(self, first: int, end: int) -> None:
-        """Keep the buckets from `first` to before `end` as well."""
+        """Extend the range to the buckets from `first` to before `end`."""
         had_first, had_end = self._first, self._first + len(self._values)
         first, end = min(first, had_first), max(end, had_end) if self._values else end
         values = array("d", bytes(8 * (end - first)))
@@ -164,7 +164,7 @@ class FadedHistogram:
         self._first, self._values, self._counts = first, values, np.frombuffer(values)
 
     def forget(self, kept: float) -> None:
-        """Only this share of what was counted still counts."""
+        """Reduce everything counted to this share."""
         self._counts *= kept
         self._lost *= kept
         self._total *= kept
@@ -173,21 +173,21 @@ class FadedHistogram:
         self._distribution = self._answered = None
 
     def held_against(self, new: Histogram, watch: ChangeWatch, now: float) -> Histogram | None:
-        """Let a watch judge samples that are still to be added by what is known now."""
+        """Let a watch judge samples, before they are added, by what is known now."""
         kept = math.exp2((self._at - now) / self._half_life_s) * self._silence.kept()
         return watch.add(new, self.snapshot(), self._lost, max(kept, _FORGOTTEN), now)
 
     def weight(self, now: float) -> float:
-        """How many samples it is worth by now, the lost and those called off included."""
+        """Return how many samples it is worth by now, including the lost and those called off."""
         return self.aged(now) * self._silence.kept()
 
     def aged(self, now: float) -> float:
-        """The same, were its like not heard of since."""
+        """Return the same as if its group had not been heard of since."""
         return self._total * math.exp2((self._at - now) / self._half_life_s)
 
     def scaled(self, now: float, sample: int) -> Histogram:
-        """The distribution as whole counts, where a sample that has not faded counts `sample`; no more of them than fit
-        a histogram, also when those of all size classes are put together."""
+        """Return the distribution as whole counts; an unfaded sample counts `sample`. Their total is limited to what
+        fits a histogram even when those of all size classes are merged."""
         found = self.distribution()
         if found is None:
             return Histogram()
@@ -197,29 +197,29 @@ class FadedHistogram:
         return Histogram.from_sparse(used.tolist(), counts[used].tolist(), round(found.never * scale))
 
     def lost_share(self) -> float:
-        """Share of the lost; NaN without samples."""
+        """Return the share of the lost; NaN without samples."""
         return self._lost / self._total if self._total > _FORGOTTEN else math.nan
 
     def snapshot(self) -> NDArray[np.float64]:
-        """Weights of the answered samples by bucket, `BUCKETS` of them, as they are now."""
+        """Return the present weights of the answered samples, for all `BUCKETS` buckets."""
         dense = np.zeros(BUCKETS)
         dense[self._first : self._first + len(self._counts)] = self._counts
         return dense
 
     def median(self) -> float:
-        """Median of the answered samples, within 2 %; NaN without any."""
+        """Return the median of the answered samples, within 2 %; NaN without any."""
         answered = self.answered()
         return answered.median() if answered is not None else math.nan
 
     def median_once(self) -> float:
-        """The same, where nobody asks again soon: nothing is kept for that."""
+        """Return the same without caching anything, for callers that do not ask again soon."""
         reached = list(accumulate(self._values))
         if not reached or reached[-1] <= _FORGOTTEN:
             return math.nan
         return MIDS[self._first + bisect_left(reached, reached[-1] / 2)]
 
     def answered(self) -> Distribution | None:
-        """The answered samples alone; None without any."""
+        """Return the distribution of the answered samples alone; None without any."""
         if self._answered is None:
             total = self._answered_total()
             if total > _FORGOTTEN:
@@ -227,17 +227,17 @@ class FadedHistogram:
         return self._answered
 
     def distribution(self) -> Distribution | None:
-        """What the samples tell; None without any.
+        """Return the distribution of the samples; None without any.
 
-        At the end of each bucket the share that is slower is that of those known to be, among all that got there
-        (Kaplan and Meier 1958). Beyond the last that was answered, what was called off counts as never answered.
+        In each bucket, the share known to be slower is taken among all samples that got there (Kaplan and Meier 1958).
+        Beyond the last answered sample, those called off count as never answered.
         """
         if self._distribution is None and self._total > _FORGOTTEN:
             self._distribution = self._known() if self._called_off is None else self._survived(self._called_off)
         return self._distribution
 
     def _answered_total(self) -> float:
-        # Over all buckets, as numpy sums up pairwise: the figure does not depend on which of them are kept.
+        # Over all buckets, as numpy sums pairwise: the result does not depend on which of them are kept.
         return float(np.add.reduce(self.snapshot()))
 
     def _known(self) -> Distribution:
@@ -260,18 +260,18 @@ K = TypeVar("K")
 V = TypeVar("V")
 
 FORGET_S = 3600.0
-"""At least so long is kept what is not reported any more: who is back after a break finds its past."""
+"""Minimum time for which something no longer reported is kept: a robot back after a break finds its past."""
 
 FORGET_HALF_LIVES = 30.0
-"""And for so many half-lives: of a billion samples one is left then."""
+"""Minimum in half-lives: of a billion samples one is left then."""
 
 
 def forget_after_s(half_life_s: float) -> float:
-    """How long what fades with this half-life is kept after it was added to last."""
+    """Return how long something with this half-life is kept after the last addition."""
     return max(FORGET_S, FORGET_HALF_LIVES * half_life_s)
 
 
 def forget_before(table: OrderedDict[K, V], since: float, at: Callable[[V], float]) -> None:
-    """Take out of a table, which is in the order of `at`, what is older."""
+    """Remove entries older than `since` from a table that is in the order of `at`."""
     while table and at(next(iter(table.values()))) < since:
         table.popitem(last=False)

@@ -1,7 +1,7 @@
-"""What one robot's requests of a service meet over an interface beyond what network and processing times explain.
+"""Estimates what one robot's requests of a service meet over an interface beyond network and processing times.
 
-Those times are of the last minutes, while outcomes tell within seconds that a radio has got bad. What is amiss is then
-mostly the interface's own, so a path over it that carries nothing is no way out: it would only look like one.
+Those times cover the last minutes, while outcomes tell within seconds that a radio has become bad. The trouble is then
+mostly the interface's own, so an idle path over it is no way out: it would only look like one.
 """
 
 from __future__ import annotations
@@ -15,11 +15,11 @@ if TYPE_CHECKING:
     from protos.model.ids import InterfaceName, NodeName
 
 SUREST = 1e-9
-"""Nothing is taken to be more probable than 1 less this, nor less probable than this."""
+"""No probability is taken to be nearer to 0 or 1 than this."""
 
 
 class InterfaceTrouble:
-    """By interface, how much worse its paths do than expected: a difference of logits, 0 where they do not."""
+    """By interface, how much worse its paths do than expected: a difference of logits, 0 if they do not."""
 
     __slots__ = ("_met",)
 
@@ -30,13 +30,13 @@ class InterfaceTrouble:
     def note(
         self, interface: InterfaceName, server: NodeName, requests: float, expected: Estimate, found: Estimate
     ) -> None:
-        """So many requests on this path bring what was expected of it, from its times, to what was found."""
+        """Note that this many requests on this path move the estimate from `expected`, by its times, to `found`."""
         worse = max(0.0, _logit(found.mean) - _logit(expected.mean))
         self._met.setdefault(interface, []).append((server, requests, worse))
 
     def moved(self, expected: Estimate, interface: InterfaceName, server: NodeName) -> Estimate:
-        """What is expected of a path, moved as much as the paths to other servers over its interface were, on average
-        over their requests."""
+        """Return what is expected of a path, moved as much as the paths to other servers over its interface were,
+        averaged over their requests."""
         others = [(requests, worse) for of, requests, worse in self._met.get(interface, ()) if of != server]
         total = sum(requests for requests, _ in others)
         worse = sum(requests * worse for requests, worse in others)

@@ -1,7 +1,7 @@
-"""How often the copies that follow a first one that misses come too late as well.
+"""Estimates how often the later copies of a request come too late as well when the first one misses.
 
-A robot avoids a path that it sees fail, so what its first copies miss is mostly what fails on all paths at once: to
-multiply the misses of two paths tells far too little. What became of earlier requests tells it: how many missed at all,
+A robot avoids a path that it sees fail, so most misses of its first copies are failures of all paths at once:
+multiplying the misses of two paths underestimates them by far. Earlier requests tell more: how many missed at all,
 beside how many first copies missed, of which a sample is measured. This remembers for long, as misses are few.
 """
 
@@ -13,11 +13,11 @@ from controlplane.core.estimate.fading import FadedCount
 from controlplane.core.estimate.posterior import USUAL_STREAK
 
 HALF_LIFE_S = 600.0
-"""As of interfaces that fail together: places change, carriers do not."""
+"""As for interfaces that fail together: places change, carriers do not."""
 
 
 class LateFate:
-    """Of one robot's service. Times are monotonic seconds."""
+    """Misses of one robot's service. Times are monotonic seconds."""
 
     __slots__ = ("_first", "_requests")
 
@@ -27,11 +27,11 @@ class LateFate:
 
     @property
     def at(self) -> float:
-        """When something was added last."""
+        """When something was last added."""
         return max(self._first.at, self._requests.at)
 
     def add_first(self, copies: float, missed: float, now: float) -> None:
-        """Count first copies, of which each would have been measured with the same probability."""
+        """Count first copies, each of which was equally likely to be measured."""
         self._first.add(copies, missed, now)
 
     def add_requests(self, requests: float, missed: float, now: float) -> None:
@@ -39,10 +39,10 @@ class LateFate:
         self._requests.add(requests, missed, now)
 
     def counts(self, now: float) -> tuple[float, float]:
-        """First copies that missed and requests that missed, in independent ones: misses come in streaks."""
+        """Return how many first copies and how many requests missed, as independent ones: misses come in streaks."""
         ratio, missed = self._first.ratio(), self._requests.ratio()
         if math.isnan(ratio) or math.isnan(missed):
             return 0.0, 0.0
         worth = self._requests.weight(now) / USUAL_STREAK
-        # Of requests that were answered in time another way, the first copy may have missed; not the other way round.
+        # A request answered in time another way may have had a first copy that missed; not the other way round.
         return worth * max(ratio, missed), worth * missed

@@ -1,8 +1,8 @@
-"""What the network costs one robot's requests: from each of its interfaces to each server, by size class.
+"""Estimates what the network costs one robot's requests: from each of its interfaces to each server, by size class.
 
 A path's own requests of the class tell best, whichever service they were for. For a path that carried few or none,
-others stand in: requests over the same interface to other servers, moved by the difference of round trips (the access
-network is where size costs time), and the path's own probes, slower by what the size costs elsewhere. A path that was
+others stand in: requests over the same interface to other servers, moved by the difference of round trips (size costs
+time mostly in the access network), and the path's own probes, slower by what the size costs elsewhere. A path that was
 not even probed gets its round trip from its two ends: how its interface and its server compare with others.
 """
 
@@ -36,46 +36,46 @@ K = TypeVar("K")
 V = TypeVar("V")
 
 MAX_PATHS = 1024
-"""Paths kept of one robot, the least recently reported goes."""
+"""Paths kept of one robot; the least recently reported one is evicted."""
 
 MAX_CELLS = 1024
-"""Network histograms kept of one robot, one for each path and size class; the least recently reported goes."""
+"""Network histograms kept of one robot, one per path and size class; the least recently reported one is evicted."""
 
 NEIGHBOURS = 2
-"""Other servers over the same interface that are asked what its requests take, those with the most of them."""
+"""Other servers over the same interface whose requests are consulted: those with the most of them."""
 
 NEIGHBOUR_REQUESTS = 20.0
-"""What a neighbour's requests are worth at most, in requests of the path itself: the servers' own networks differ."""
+"""Maximum worth of a neighbour's requests, in requests of the path itself: the servers' own networks differ."""
 
 PROBES_REQUESTS = 5.0
-"""What the path's probes are worth at most: they are small, so how large requests spread they do not know."""
+"""Maximum worth of the path's probes: they are small, so they do not show how large requests spread."""
 
 ENDS_REQUESTS = 1.0
-"""What a round trip that was put together from the two ends is worth."""
+"""Worth of a round trip that was derived from the two ends."""
 
 SIZE_COST_REQUESTS = 20.0
 """Requests a path must have carried before its median tells what their size costs."""
 
 
 class Witness(NamedTuple):
-    """Something that tells of a path's times in the network, for requests of one class."""
+    """A source of a path's times in the network, for requests of one class."""
 
     requests: float
-    """What it is worth in requests of the path itself ..."""
+    """Its worth in requests of the path itself ..."""
     samples: float
     """... and how many samples it rests on."""
     times: Distribution
     later_s: float
-    """Add this to all of its times."""
+    """Added to all of its times."""
     resent: float = 0.0
     """Probability that, beyond its times, something is lost and sent again ..."""
     resend_s: float = 0.0
-    """... which takes so much longer."""
+    """... which takes this much longer."""
     itself: bool = False
-    """These are requests on the very path."""
+    """Whether these are requests on the very path."""
 
     def exceeds(self, processing: Distribution | None, seconds: float) -> float:
-        """P(network + processing > seconds)."""
+        """Return P(network + processing > seconds)."""
         left = seconds - self.later_s
         prompt = self.times.sum_exceeds(processing, left)
         if not self.resent:
@@ -83,7 +83,7 @@ class Witness(NamedTuple):
         return (1.0 - self.resent) * prompt + self.resent * self.times.sum_exceeds(processing, left - self.resend_s)
 
     def exceeds_each(self, processing: Distribution | None, seconds: NDArray[np.float64]) -> NDArray[np.float64]:
-        """P(network + processing > s) for each s."""
+        """Return P(network + processing > s) for each s."""
         left = seconds - self.later_s
         prompt = self.times.sums_exceed(processing, left)
         if not self.resent:
@@ -93,20 +93,20 @@ class Witness(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class PathView:
-    """One path of a robot, as reported last."""
+    """One path of a robot, as last reported."""
 
     interface: InterfaceName
     server: NodeName
     up: bool
     round_trip_s: float
-    """The median, within 2 %; NaN where none is known."""
+    """The median, within 2 %; NaN if none is known."""
     leads_there: bool = True
-    """Whether it ever was up, or nothing ever was over its interface: else its being down tells nothing."""
+    """Whether it ever was up, or nothing ever was over its interface; otherwise its being down tells nothing."""
 
 
 @dataclass(slots=True)
 class PathState:
-    """What is known of one path but its requests."""
+    """Everything known of one path except its requests."""
 
     up: bool
     rtt: FadedHistogram
@@ -116,10 +116,10 @@ class PathState:
     """Whether it ever was up."""
 
     def loss(self) -> float:
-        """Share of what was sent that got lost, as datagrams or as probes, whichever is worse."""
+        """Return the lost share of what was sent, of datagrams or of probes, whichever is worse."""
         worst = 0.0
         for ratio in (self.datagrams.ratio(), self.rtt.lost_share()):
-            # Of what nothing was sent it is NaN, which is not larger than anything.
+            # NaN if nothing was sent, and NaN is not larger than anything.
             if ratio > worst:
                 worst = ratio
         return worst
@@ -135,28 +135,28 @@ class RobotNetwork:
         """Interfaces over which any server ever answered."""
         self._cells: OrderedDict[CellKey, FadedHistogram] = OrderedDict()
         self._clocks: dict[int, HeardClock] = {}
-        """Of the cells of each size class."""
+        """One for the cells of each size class."""
         self._round_trips: dict[PathKey, float] = {}
         """Median of each path that was probed."""
         self._rows: dict[tuple[InterfaceName, int], list[CellKey]] = {}
-        """The cells of each interface and size class, those with most requests first."""
+        """The cells of each interface and size class, those with the most requests first."""
         self._size_costs: dict[tuple[InterfaceName, int], float] = {}
         self._size_costs_anywhere: dict[int, float] = {}
         self._guessed: dict[PathKey, float] = {}
         """Round trips that were not measured."""
         self._fresh = False
-        """Whether these follow from what was merged."""
+        """Whether these tables reflect everything merged."""
         self.most = MAX_PATHS + MAX_CELLS
-        """No new ones beyond so many histograms."""
+        """Number of histograms beyond which no new ones are added."""
         self.dropped = 0
-        """Entries evicted, or not taken, because a table was full."""
+        """Entries evicted, or refused, because a table was full."""
 
     def __len__(self) -> int:
-        """Histograms kept."""
+        """Return the number of histograms kept."""
         return len(self.paths) + len(self._cells)
 
     def merge_path(self, path: PathReport, now: float) -> bool:
-        """Add a path's report; True if it went up or down, or is new."""
+        """Add a path's report; return True if it went up or down, or is new."""
         self._fresh = False
         key = (path.interface, path.server)
         state = known = self.paths.get(key)
@@ -173,14 +173,14 @@ class RobotNetwork:
                 self._answered_over.add(path.interface)
         state.last = path
         state.rtt.add(path.rtt, now)
-        # What was sent before the last report may be found lost only now: no more is lost than is sent.
+        # Datagrams sent before the last report may be found lost only now: no more count as lost than were sent.
         state.datagrams.add(path.datagrams_sent, min(path.datagrams_lost, path.datagrams_sent), now)
         return changed
 
     def leads_there(self, key: PathKey) -> bool:
-        """Whether the path was up once, or nothing ever was over its interface.
+        """Return whether the path ever was up, or nothing ever was over its interface.
 
-        What an interface never reached while it reached others, as another site's server, is no sign of a failure.
+        A server that an interface never reached while it reached others, as another site's, is no sign of a failure.
         """
         return self.paths[key].answered or key[0] not in self._answered_over
 
@@ -203,7 +203,7 @@ class RobotNetwork:
         cell.add(report.network, now, report.called_off)
 
     def _has_room(self) -> bool:
-        """Whether one more histogram may be kept; counted if not."""
+        """Return whether one more histogram may be kept; count it as dropped if not."""
         if len(self) < self.most:
             return True
         self.dropped += 1
@@ -217,27 +217,27 @@ class RobotNetwork:
             self.dropped += 1
 
     def forget_before(self, since: float) -> None:
-        """Forget what was not reported since."""
+        """Forget what has not been reported since then."""
         kept = len(self)
         forget_before(self.paths, since, lambda path: path.rtt.at)
         forget_before(self._cells, since, lambda cell: cell.at)
         self._fresh = self._fresh and len(self) == kept
 
     def forget_paths(self) -> None:
-        """Whether paths are up is not known any more, nor what they take by now; requests still tell."""
-        # Another table: who holds the one of a robot that went keeps what was known.
+        """Forget whether paths are up and what they take by now; requests still tell."""
+        # Use a new table: a holder of the old one, of a robot that left, keeps what was known.
         self.paths = OrderedDict()
         self._fresh = False
 
     def requests(
         self, interface: InterfaceName, server: NodeName, size_class: int, now: float, *, sample: int
     ) -> Histogram:
-        """What requests of the class took on this path; a sample that has not faded counts `sample`."""
+        """Return what requests of the class took on this path; an unfaded sample counts `sample`."""
         cell = self._cells.get((interface, server, size_class))
         return cell.scaled(now, sample) if cell is not None else Histogram()
 
     def witnesses(self, interface: InterfaceName, server: NodeName, size_class: int, now: float) -> Iterator[Witness]:
-        """All that tells what requests of the class would take from the interface to the server."""
+        """Yield all that tells what requests of the class would take from the interface to the server."""
         self._refresh(now)
         key = (interface, server)
         own = self._cells.get((*key, size_class))
@@ -266,7 +266,7 @@ class RobotNetwork:
         yield from self._probed(key, round_trip, loss, size_class, now)
 
     def _probed(self, key: PathKey, round_trip: float, loss: float, size_class: int, now: float) -> Iterator[Witness]:
-        """The path's probes, or those of one that looks like it, slower by what the size costs."""
+        """Yield the path's probes, or those of a similar path, slower by what the size costs."""
         if math.isnan(round_trip):
             return
         path = self.paths.get(key)
@@ -282,10 +282,10 @@ class RobotNetwork:
             yield Witness(min(samples, PROBES_REQUESTS), samples, answered, later_s, loss, round_trip)
 
     def _round_trip(self, key: PathKey) -> tuple[float, bool]:
-        """Median round trip of a path, and whether it was measured; NaN if its ends tell nothing either.
+        """Return the median round trip of a path, and whether it was measured; NaN if its ends tell nothing either.
 
-        If it was not: i to j takes what i to l takes, and what k to j takes longer than k to l; in the median over all
-        k and l. Without such a square, the median over the interface's paths, or else over the server's.
+        If it was not measured: i to j takes as long as i to l, plus what k to j takes longer than k to l; in the median
+        over all k and l. Without such a square, it is the median over the interface's paths, or else over the server's.
         """
         if key in self._round_trips:
             return self._round_trips[key], True
@@ -304,7 +304,7 @@ class RobotNetwork:
         return math.nan
 
     def _size_cost(self, interface: InterfaceName, size_class: int, now: float) -> float:
-        """How much slower than probes requests of the class are, in seconds: over this interface, or else over any."""
+        """Return how many seconds slower than probes requests of the class are: over this interface, else over any."""
         key = (interface, size_class)
         if key not in self._size_costs:
             found = self._costs(self._rows.get(key, ()), now)

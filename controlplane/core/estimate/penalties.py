@@ -1,7 +1,7 @@
-"""Servers that a robot's sidecar asks only where no other is, as it told, because their answers could not be delivered.
+"""Keeps the servers that a robot's sidecar asks only as a last resort, because their answers could not be delivered.
 
-A mapping that names such a server is not followed. So other servers go before it here as they do there: for this robot
-alone, as nobody else bears out what it says.
+A mapping that names such a server is not followed. So here, as there, other servers go before it: for this robot alone,
+as nobody else confirms what it says.
 """
 
 from __future__ import annotations
@@ -16,11 +16,11 @@ if TYPE_CHECKING:
     from protos.model.ids import NodeName
 
 LONGEST_S = 600.0
-"""No sidecar keeps a server out for longer (`sidecar.core.robot.dispatch.penalties`), whatever it says."""
+"""No sidecar penalises a server for longer (`sidecar.core.robot.dispatch.penalties`), whatever it reports."""
 
 
 class Penalties:
-    """What one robot told last, and until when it holds. Times are monotonic seconds."""
+    """Penalties that one robot reported last, and until when they hold. Times are monotonic seconds."""
 
     __slots__ = ("_until",)
 
@@ -28,7 +28,7 @@ class Penalties:
         self._until: dict[NodeName, tuple[float, int]] = {}
 
     def replace(self, told: Collection[PenaltyReport], now: float) -> bool:
-        """These are all that are in force; True if the servers are not those of before."""
+        """Replace all that are in force; return True if the set of servers changed."""
         if not told and not self._until:
             return False
         before = self._until.keys()

@@ -1,4 +1,4 @@
-"""What is believed of a probability: Beta distributions, and trials whose outcomes come in streaks."""
+"""Represents what is believed of a probability: Beta distributions, and trials whose outcomes come in streaks."""
 
 from __future__ import annotations
 
@@ -12,42 +12,41 @@ if TYPE_CHECKING:
     from controlplane.core.estimate.staleness import HeardClock
 
 MEMORIES = ((1.0, 1.0), (1 / 4, 0.3), (1 / 15, 0.3))
-"""Half-lives of the memories beside each other, as parts of the configured one, and how likely each is to be the best
-before anything is known: a steady path is known best by a long memory, one that enters a tunnel by a short one."""
+"""Half-lives of the parallel memories, as parts of the configured one, and the prior probability that each is the best:
+a long memory knows a steady path best, a short one a path that enters a tunnel."""
 
 SCORE_HALF_LIFE = 1 / 3
 """Half-life, as a part of the configured one, of the record of how well each memory predicted."""
 
 HANDED_ON = 2.0
-"""Trials that a memory's ratio is worth to the next shorter one, which starts from it."""
+"""Worth in trials of a memory's ratio to the next shorter one, which starts from it."""
 
 BATCH_S = 5.0
-"""Outcomes are summed up over this long before their spread is looked at: a handover is within, an outage spans a
-few."""
+"""Outcomes are summed over this long before their spread is examined: a handover is within, an outage spans a few."""
 
 USUAL_STREAK = 5.0
 """By how much streaks usually inflate the variance of a miss ratio."""
 
 USUAL_STREAK_BATCHES = 4.0
-"""How many batches that experience weighs."""
+"""How many batches that experience is worth."""
 
 MAX_BATCH_CORRELATION = 0.9
-"""Nothing that fades within a minute can tell a longer memory from a change."""
+"""Limit, as nothing that fades within a minute can tell a longer memory from a change."""
 
 _SURE = 1e-6
-"""No ratio is believed to be nearer to 0 or 1 when predictions are scored."""
+"""No ratio is taken to be nearer to 0 or 1 when predictions are scored."""
 
 
 @dataclass(frozen=True, slots=True)
 class Estimate:
-    """A probability, known as Beta(misses, hits): both above 0, and larger the more is known."""
+    """A probability, known as Beta(misses, hits): both are above 0 and grow with what is known."""
 
     misses: float
     hits: float
 
     @property
     def mean(self) -> float:
-        """The probability that is expected."""
+        """Expected probability."""
         return self.misses / (self.misses + self.hits)
 
     @property
@@ -57,12 +56,12 @@ class Estimate:
 
     @classmethod
     def of(cls, mean: float, weight: float) -> Estimate:
-        """An estimate of that mean and weight; 0 < mean < 1."""
+        """Return an estimate of that mean and weight; 0 < mean < 1."""
         return cls(mean * weight, (1.0 - mean) * weight)
 
 
 IGNORANCE = Estimate(0.5, 0.5)
-"""Jeffreys' prior: of what nothing is known, one in two misses."""
+"""Jeffreys' prior: without any knowledge, one in two misses."""
 
 
 class _Memory:
@@ -77,7 +76,7 @@ class _Memory:
 
 
 class _Streaks:
-    """How much more batches of misses spread around what was predicted than independent misses would."""
+    """How much more batches of misses spread around the prediction than independent misses would."""
 
     __slots__ = (
         "_batches",
@@ -128,14 +127,14 @@ class _Streaks:
 
 
 class FadedTrials:
-    """Trials and those among them that missed, fading, with what they tell of the next one.
+    """Trials and those of them that missed, fading, with what they tell of the next one.
 
-    Several memories of different length stand beside each other. Each shorter one starts from the ratio of the longer
-    one before it, and all are averaged by how well they predicted lately: weights proportional to the likelihood of
+    Several memories of different lengths run in parallel. Each shorter one starts from the ratio of the longer one
+    before it. All are averaged by how well they predicted recently: their weights are proportional to the likelihood of
     what came, as in Bayesian model averaging with forgetting. Misses come in streaks, so n trials say less than n
-    independent ones: the variance of the prediction's errors over batches of `BATCH_S` beside that of independent
-    trials, times (1 + r) / (1 - r) for the correlation r of neighbouring batches, is the design effect; n divided by it
-    is what the trials are worth. With the clock of their like they fade faster while only these are heard of.
+    independent ones. The design effect is the variance of the prediction's errors over batches of `BATCH_S` relative to
+    that of independent trials, times (1 + r) / (1 - r) for the correlation r of neighbouring batches; the trials are
+    worth n divided by it. With the clock of their group they fade faster while only others of the group are heard of.
     """
 
     __slots__ = ("_at", "_half_life_s", "_memories", "_silence", "_streaks")
@@ -149,11 +148,11 @@ class FadedTrials:
 
     @property
     def at(self) -> float:
-        """When something was added last."""
+        """When something was last added."""
         return self._at
 
     def add(self, trials: float, misses: float, now: float) -> None:
-        """Count trials, `misses` of them missed."""
+        """Count trials, of which `misses` missed."""
         passed_s = now - self._at
         self._at = now
         self.forget(self._silence.end())
@@ -171,7 +170,7 @@ class FadedTrials:
         self._streaks.add(trials, misses, predicted, now)
 
     def forget(self, kept: float) -> None:
-        """Only this share of what was counted still counts."""
+        """Reduce everything counted to this share."""
         if kept < 1.0:
             for memory in self._memories:
                 memory.trials *= kept
@@ -179,9 +178,9 @@ class FadedTrials:
                 memory.score *= kept
 
     def _predict(self, prior: Estimate, passed_s: float) -> tuple[float, float, list[float]]:
-        """(ratio, trials) after so many more seconds over all memories, by how well each predicted; and their ratios.
+        """Return (ratio, trials) this much later, over all memories by how well each predicted; and their ratios.
 
-        Each memory starts from the one before, the longest from the prior.
+        Each memory starts from the one before it, the longest from the prior.
         """
         kept = self._silence.kept()
         best = max([memory.score for memory in self._memories])
@@ -200,16 +199,16 @@ class FadedTrials:
         return mean / shares, mean_trials / shares, ratios
 
     def counts(self, now: float) -> tuple[float, float]:
-        """Trials and misses that the longest memory still holds."""
+        """Return the trials and misses that the longest memory still holds."""
         fade = math.exp2((self._at - now) / self._half_life_s) * self._silence.kept()
         return self._memories[0].trials * fade, self._memories[0].misses * fade
 
     def design_effect(self) -> float:
-        """By how much streaks inflate the variance of the ratio, at least 1."""
+        """Return by how much streaks inflate the variance of the ratio, at least 1."""
         return self._streaks.design_effect()
 
     def posterior(self, prior: Estimate, now: float) -> Estimate:
-        """The prior, and what the trials say: their mean counts every trial, the weight only what they are worth."""
+        """Return the prior updated by the trials: the mean counts every trial, the weight only what they are worth."""
         passed_s = now - self._at
         mean, trials, _ = self._predict(prior, passed_s)
         return Estimate.of(mean, trials / self.design_effect() + prior.weight)

@@ -1,4 +1,4 @@
-"""What servers need to compute an answer: by server and service, whoever asked."""
+"""Estimates what servers need to compute an answer, by server and service, from the reports of all robots."""
 
 from __future__ import annotations
 
@@ -17,31 +17,31 @@ if TYPE_CHECKING:
     from protos.model.ids import NodeName, ServiceName
 
 MAX_PROCESSING = 8192
-"""Processing histograms kept, one for each (server, service); the least recently reported goes."""
+"""Processing histograms kept, one for each (server, service); the least recently reported one is evicted."""
 
 MAX_PROCESSING_OF_SERVER = 1024
-"""Of these for one server, as many as it may offer at once: one that changes its offers evicts nobody else's."""
+"""Limit per server, as many as it may offer at once: one that changes its offers evicts nobody else's."""
 
 OTHERS_REQUESTS = 1.0
-"""What the other servers of a service are worth, in requests to a server itself: machines are not alike."""
+"""Worth of the other servers of a service, in requests to the server itself: machines are not alike."""
 
 ENOUGH_REQUESTS = 50.0
-"""Requests from which on a server's own times stand alone."""
+"""Number of requests from which a server's own times stand alone."""
 
 DOUBTED_REQUESTS = 0.25
-"""What a server's times are still worth when another one has changed, and it was heard of ..."""
+"""Remaining worth of a server's times after another one has changed, if it was heard of ..."""
 
 HEARD_REQUESTS, LATELY_HALF_LIFE_S = 1.6, 2.0
-"""... less often than this lately, fading with this half-life: by exploration alone, not by use."""
+"""... less often than this recently, fading with this half-life: by exploration alone, not by use."""
 
 
 class ServerTimes(NamedTuple):
     """What a server is thought to need."""
 
     times: Distribution | None
-    """None as long as nobody has asked any server."""
+    """None until somebody has asked any server."""
     requests: float
-    """How many of its own requests that rests on."""
+    """How many of its own requests they rest on."""
 
 
 @dataclass(slots=True)
@@ -57,7 +57,7 @@ class _OfServer:
     """What it needed before the last change."""
 
     def changed_with(self, robot: NodeName, processing: Histogram, now: float) -> Histogram | None:
-        """What came since the server changed, if these samples of a robot show that; they are still to be added."""
+        """Return what came since the server changed, if these samples of a robot, still to be added, show a change."""
         if not processing.total:
             return None
         since = self.times.held_against(processing, self.watch, now)
@@ -77,32 +77,32 @@ class _OfServer:
 
 @dataclass(slots=True)
 class _OfService:
-    """What is known of a service whichever server."""
+    """What is known of a service over all servers."""
 
     clock: HeardClock
     servers: dict[NodeName, FadedHistogram] = field(default_factory=dict)
     usual: Distribution | None = None
-    """Of all servers, each as one; None as long as it has to be worked out."""
+    """Distribution over all servers, each as one; None until it is computed."""
 
 
 class ComputeTimes:
-    """Processing times, fading, of every server and, for those not heard of, what a service's servers usually need.
+    """Fading processing times of every server, and what a service's servers usually need, for those not heard of.
 
-    A server that has changed is known by what came since alone.
+    A server that has changed is known only by what came since.
     """
 
     def __init__(self, half_life_s: float) -> None:
         self._half_life_s = half_life_s
         self._servers: OrderedDict[tuple[NodeName, ServiceName], _OfServer] = OrderedDict()
         self._services: dict[ServiceName, _OfService] = {}
-        """Of the servers kept."""
+        """Services of the servers kept."""
         self._kept: dict[NodeName, OrderedDict[ServiceName, None]] = {}
-        """Services kept of each server, the one reported least recently first."""
+        """Services kept of each server, the least recently reported one first."""
         self.dropped = 0
         """Entries evicted because a table was full."""
 
     def merge(self, robot: NodeName, server: NodeName, service: ServiceName, processing: Histogram, now: float) -> bool:
-        """Add what a server needed, as a robot says; True if that is not what it needed before."""
+        """Add what a server needed, as a robot reports; return True if that is not what it needed before."""
         samples = processing.total
         if not samples:
             return False
@@ -130,9 +130,9 @@ class ComputeTimes:
             self._drop(server, next(iter(kept)))
         elif len(self._servers) > MAX_PROCESSING:
             self._drop(*next(iter(self._servers)))
-        # No more than a robot may count for: what it says of one moment shall not pass for minutes.
+        # At most what a robot may count for: what it says of one moment must not pass for minutes.
         of_server.lately.add(min(samples, int(COUNTS_ANYWAY)), 0.0, now)
-        # Not before: it may be the first to be reported on after a long time.
+        # Not earlier: this may be the server's first report after a long time.
         self._forget_old(now)
         processing = of_server.witnesses.weigh(robot, processing, now)
         since = of_server.changed_with(robot, processing, now)
@@ -148,7 +148,7 @@ class ComputeTimes:
         return True
 
     def _doubt_others(self, service: ServiceName, of_service: _OfService, now: float) -> None:
-        """Load moved, and nobody knows where from or to: servers hardly heard of lately are hardly known any more."""
+        """Discount servers hardly heard of recently: load moved, and nobody knows from where or to where."""
         for name, times in of_service.servers.items():
             of_server = self._servers[name, service]
             if of_server.lately.weight(now) < HEARD_REQUESTS:
@@ -157,7 +157,7 @@ class ComputeTimes:
                 times.forget(DOUBTED_REQUESTS / max(times.weight(now), DOUBTED_REQUESTS))
 
     def _forget_old(self, now: float) -> None:
-        """Servers that nobody has heard of for long: there may be ever new ones, and all count for the usual times."""
+        """Forget servers not heard of for long: new ones may keep coming, and all count for the usual times."""
         since = now - forget_after_s(self._half_life_s)
         while True:
             oldest, of_server = next(iter(self._servers.items()))
@@ -182,32 +182,32 @@ class ComputeTimes:
             of_service.usual = None
 
     def changes(self, server: NodeName, service: ServiceName) -> tuple[int, Distribution | None]:
-        """How often a server changed, and what it needed before it did so last."""
+        """Return how often a server changed, and what it needed before the last change."""
         of_server = self._servers.get((server, service))
         return (of_server.changes, of_server.before) if of_server is not None else (0, None)
 
     def is_odd(self, server: NodeName, service: ServiceName) -> bool:
-        """Whether the server's last answers were odd, so that it may have changed."""
+        """Return whether the server's last answers were odd, so that it may have changed."""
         of_server = self._servers.get((server, service))
         return of_server is not None and of_server.watch.suspects
 
     def requests(self, server: NodeName, service: ServiceName, now: float, *, sample: int) -> Histogram:
-        """What the server itself needed; a sample that has not faded counts `sample`."""
+        """Return what the server itself needed; an unfaded sample counts `sample`."""
         of_server = self._servers.get((server, service))
         return of_server.times.scaled(now, sample) if of_server is not None else Histogram()
 
     def witnesses(self, server: NodeName, service: ServiceName) -> int:
-        """How many robots said what the server needs."""
+        """Return how many robots reported what the server needs."""
         of_server = self._servers.get((server, service))
         return len(of_server.witnesses) if of_server is not None else 0
 
     def busiest_witness(self, server: NodeName, service: ServiceName, now: float) -> tuple[NodeName, float] | None:
-        """The robot whose word counts for most, and for what share of all; None without any."""
+        """Return the robot whose word counts for most, and its share of all; None without any."""
         of_server = self._servers.get((server, service))
         return of_server.witnesses.largest_share(now) if of_server is not None else None
 
     def times(self, server: NodeName, service: ServiceName, now: float) -> ServerTimes:
-        """What the server is thought to need: less of its own times, and more of the usual, the fewer these are."""
+        """Return what the server is thought to need: the fewer its own times, the more the usual ones count."""
         of_server = self._servers.get((server, service))
         own = of_server.times.distribution() if of_server is not None else None
         requests = of_server.times.weight(now) if of_server is not None else 0.0
@@ -220,7 +220,7 @@ class ComputeTimes:
         return ServerTimes(Distribution.mixed(own, share, usual), requests)
 
     def _usual(self, service: ServiceName, now: float) -> Distribution | None:
-        """What a server of the service needs whose name is not known: of each server as much as is known of it."""
+        """Return what an unknown server of the service needs: each server counts by how much is known of it."""
         of_service = self._services.get(service)
         if of_service is None:
             return None

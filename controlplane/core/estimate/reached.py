@@ -1,8 +1,8 @@
-"""Which robots have reached which servers: whose silence tells something of a server.
+"""Remembers which robots have reached which servers: whose silence tells something of a server.
 
-A robot may be told of servers that no network leads it to (another site's). That it does not reach these says nothing;
-that it does not reach one that it did reach does. One robot may be hacked: that it reaches a server, or did, proves
-nothing against two that do not: of a server that nobody else ever reached.
+A robot may know servers that no network leads it to (another site's). That it does not reach these says nothing; that
+it does not reach one that it did reach does. One robot may be hacked: if nobody else ever reached a server, that this
+robot reaches it, or did, proves nothing against two that do not.
 """
 
 from __future__ import annotations
@@ -14,16 +14,16 @@ if TYPE_CHECKING:
     from protos.model.ids import NodeName
 
 MAX_PAIRS = 131_072
-"""Pairs of robot and server remembered, also of robots that are gone; the one that reached longest ago goes. As many as
-4,096 robots and 32 servers make."""
+"""Pairs of robot and server remembered, also of robots that are gone: as many as 4,096 robots and 32 servers make. The
+one that reached longest ago is evicted."""
 
 
 class Reached:
-    """Remembers it since the start."""
+    """The pairs that reached each other since the start."""
 
     def __init__(self) -> None:
         self._pairs: OrderedDict[tuple[NodeName, NodeName], None] = OrderedDict()
-        """The one that was noted longest ago first."""
+        """The least recently noted pair first."""
         self._servers_of: dict[NodeName, set[NodeName]] = {}
         self._robots_of: Counter[NodeName] = Counter()
         self.forgotten = 0
@@ -32,7 +32,7 @@ class Reached:
         return len(self._pairs)
 
     def note(self, robot: NodeName, server: NodeName) -> None:
-        """The robot reaches the server now."""
+        """Note that the robot reaches the server now."""
         pair = (robot, server)
         known = pair in self._pairs
         self._pairs[pair] = None
@@ -56,14 +56,14 @@ class Reached:
             del self._robots_of[server]
 
     def forget(self, robot: NodeName) -> None:
-        """This robot's word counts for nothing any more."""
+        """Discard everything noted of this robot."""
         for server in list(self._servers_of.get(robot, ())):
             self._drop(robot, server)
 
     def by(self, robot: NodeName, server: NodeName) -> bool:
-        """Whether this robot ever reached the server."""
+        """Return whether this robot ever reached the server."""
         return (robot, server) in self._pairs
 
     def witnesses(self, server: NodeName) -> int:
-        """How many robots, there or gone, have."""
+        """Return how many robots, present or gone, ever reached the server."""
         return self._robots_of[server]

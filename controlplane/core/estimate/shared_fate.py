@@ -1,8 +1,8 @@
-"""Whether requests that miss over one of a robot's interfaces miss over another one as well.
+"""Judges whether requests that miss over one of a robot's interfaces miss over another one as well.
 
-What is asked here is what two interfaces have in common, such as a carrier, not what a path does this minute: so this
-remembers for long, whichever servers a mapping names meanwhile, and what chance would bring comes from the same
-requests. Why so: docs/develop/theory.md, "Interfaces that fail together".
+The question is what two interfaces have in common, such as a carrier, not what a path does this minute. So this
+remembers for long, whichever servers a mapping names meanwhile, and compares with the chance in the same requests.
+Reasons: docs/develop/theory.md, "Interfaces that fail together".
 """
 
 from __future__ import annotations
@@ -24,13 +24,13 @@ HALF_LIFE_S = 600.0
 """Carriers do not change, places do: trouble a few minutes apart counts together, that of another district does not."""
 
 MIN_BOTH_MISSED = 2.0
-"""Common misses below which nothing is said."""
+"""Number of common misses below which nothing is said."""
 
 MIN_LIFT = 1.5
-"""How many times as often as by chance both must have missed: what is nearer to 1 is not worth telling."""
+"""How many times as often as by chance both must have missed; a value nearer to 1 is not worth reporting."""
 
 SURE, LIKELY = 0.01, 0.05
-"""How probable so many common misses may be by chance for interfaces that fail together, and for those that seem to."""
+"""Limits on the chance of that many common misses, for interfaces that fail together and that seem to."""
 
 ALONE_PRIOR, RACE_PRIOR = 0.5, 1.0
 """Jeffreys' prior for missing on one interface alone, in races."""
@@ -42,7 +42,7 @@ class CommonMisses:
 
     requests: float
     first_missed: float
-    """Of these requests; estimated from all that missed on both, and from the races that missed on one; above 0."""
+    """Misses among these requests, above 0; estimated from all that missed on both and races that missed on one."""
     second_missed: float
     both_missed: float
     correlation: Correlation
@@ -82,7 +82,7 @@ class _Batches:
         self._last_n, self._last_b = n, b
 
     def design_effect(self) -> float:
-        """By how much streaks inflate the variance of the number of common misses, at least 1."""
+        """Return by how much streaks inflate the variance of the number of common misses, at least 1."""
         ratio = self._b / self._n if self._n else 0.0
         independent = ratio * (1.0 - ratio) * self._n
         if self._count < 1.0 or independent <= 0.0:
@@ -110,11 +110,11 @@ class SharedFate:
 
     @property
     def at(self) -> float:
-        """When something was added last."""
+        """When something was last added."""
         return self._at
 
     def add(self, report: InterfaceJointReport, now: float) -> None:
-        """Count what a report tells."""
+        """Count what a report says."""
         kept = math.exp2((self._at - now) / HALF_LIFE_S)
         self._at = now
         news = (
@@ -135,7 +135,7 @@ class SharedFate:
             self._batch_requests = self._batch_missed = 0.0
 
     def common_misses(self, now: float) -> CommonMisses | None:
-        """What is known; None without requests."""
+        """Return what is known; None without requests."""
         kept = math.exp2((self._at - now) / HALF_LIFE_S)
         requests, both, races, only_first, only_second = (count * kept for count in self._counts)
         if requests < RACE_PRIOR:
@@ -156,7 +156,7 @@ class SharedFate:
         rarer, other = sorted((first, second))
         events, common = requests * rarer / streaks, both_missed / streaks
         a, b = np.array([common]), np.array([events - common + 1.0])
-        # Clopper and Pearson's limit: above it, so many would be common by chance with less than this probability.
+        # Clopper-Pearson limit: above it, this many have less than this probability to be common by chance.
         if quantiles(a, b, SURE)[0] > other:
             return Correlation.TOGETHER
         return Correlation.LIKELY if quantiles(a, b, LIKELY)[0] > other else Correlation.INDEPENDENT

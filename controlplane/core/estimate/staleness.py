@@ -1,8 +1,8 @@
-"""How much of old evidence still counts when one thing has not been heard of while its like have.
+"""Decides how much of old evidence still counts when one thing has not been heard of while its group has.
 
 What keeps being measured fades slowly, as its past is worth something beside its present. A server that nobody asks any
-more may be idle by now, or busy: the longer its like were asked without it, the less its past tells of its present (a
-restless bandit, Whittle 1988). Pauses in which none of them was heard of do not count.
+more may be idle by now, or busy: the longer its group was asked without it, the less its past tells of its present (a
+restless bandit, Whittle 1988). Pauses in which none of the group was heard of do not count.
 """
 
 from __future__ import annotations
@@ -10,17 +10,17 @@ from __future__ import annotations
 import math
 
 GRACE_S = 2.0
-"""So long silence takes nothing away: reports of what is in use have gaps."""
+"""Silence up to this long takes nothing away: reports of what is in use have gaps."""
 
 HALF_LIFE_S = 3.0
-"""From then on, of evidence that is not refreshed: loads and radio cells change within some ten seconds."""
+"""Half-life, from then on, of evidence that is not refreshed: loads and radio cells change within some ten seconds."""
 
 LONGEST_GAP_S = 2.0
-"""Between two times that any of a group was heard of; more is a pause."""
+"""Longest gap between two reports on any of a group; more is a pause."""
 
 
 class HeardClock:
-    """How long a group of like things has been heard of: seconds without pauses."""
+    """How long a group of similar things has been heard of: seconds without pauses."""
 
     __slots__ = ("_at", "seconds")
 
@@ -29,7 +29,7 @@ class HeardClock:
         self._at = now
 
     def hear(self, now: float) -> None:
-        """One of them was heard of; to be called before that is counted."""
+        """Note that one of them was heard of; call this before counting it."""
         self.seconds += min(now - self._at, LONGEST_GAP_S)
         self._at = now
 
@@ -44,14 +44,14 @@ class Silence:
         self._since = clock.seconds if clock is not None else 0.0
 
     def kept(self) -> float:
-        """The share of its evidence that still counts."""
+        """Return the share of its evidence that still counts."""
         if self._clock is None:
             return 1.0
         over_s = self._clock.seconds - self._since - GRACE_S
         return 1.0 if over_s <= 0.0 else math.exp2(-over_s / HALF_LIFE_S)
 
     def end(self) -> float:
-        """It is heard of: the share of its older evidence that counts from now on."""
+        """End the silence; return the share of its older evidence that counts from now on."""
         kept = self.kept()
         if self._clock is not None:
             self._since = self._clock.seconds

@@ -1,11 +1,11 @@
-"""Servers that take requests and answer none: their sidecar is there, and the ROS node behind it hangs.
+"""Finds servers that take requests and answer none: their sidecar is there, but the ROS node behind it hangs.
 
-A robot says of each copy that it measures whether its server had the whole request and yet gave no answer. One answer
-ends what that robot said before; answers to two robots end what all of them said before.
+For each copy that a robot measures, it reports whether the server had the whole request and yet gave no answer. One
+answer ends what that robot said before; answers to two robots end what all of them said before.
 
 One robot may be hacked, or merely odd. So a robot's word counts for no more than those of all others who say the same,
-and against one who says that it got an answer it takes two who did not. Alone a robot is believed if nobody else got an
-answer lately. Times are monotonic seconds.
+and two who got no answer outweigh one who says that it got one. A lone robot is believed if nobody else got an answer
+recently. Times are monotonic seconds.
 """
 
 from __future__ import annotations
@@ -25,16 +25,16 @@ if TYPE_CHECKING:
     Pair = tuple[NodeName, ServiceName]
 
 MAX_WORDS_OF_ROBOT = 64
-"""Pairs of server and service of which one robot's word is kept; the one that it spoke of longest ago goes."""
+"""Pairs of server and service for which one robot's word is kept; the one it mentioned longest ago is evicted."""
 
 MAX_ANSWERED = 4
 """Robots kept that got an answer last, for each pair: two are needed, and nobody can take the places of all."""
 
 LATELY_S = 120.0
-"""For so long an answer to another robot speaks against one that alone gets none: one request of eight is measured."""
+"""For this long an answer to another robot contradicts one that alone gets none: one request in eight is measured."""
 
 REMEMBERED_S = 600.0
-"""After so long a robot's word that it gets no answer does not count any more."""
+"""After this long a robot's word that it gets no answer no longer counts."""
 
 
 @dataclass(slots=True)
@@ -48,29 +48,29 @@ class _Lost:
 
 @dataclass(slots=True)
 class _Row:
-    """What robots said last of one pair; each stands in one of the two."""
+    """What robots said last of one pair; each robot is in one of the two tables."""
 
     lost: dict[NodeName, _Lost] = field(default_factory=dict)
     answered: dict[NodeName, float] = field(default_factory=dict)
-    """When it said that it got an answer, the earliest first."""
+    """When each robot said that it got an answer, the earliest first."""
 
 
 class Unanswered:
-    """How many requests each server left unanswered, by service. Bounded by the robots that are there."""
+    """How many requests each server left unanswered, by service. Bounded by the number of robots present."""
 
     def __init__(self) -> None:
         self._rows: dict[Pair, _Row] = {}
         self._words: dict[NodeName, OrderedDict[Pair, None]] = {}
-        """In which rows each robot stands."""
+        """The rows that each robot is in."""
         self.forgotten = 0
-        """Words of robots who spoke of more pairs than are kept."""
+        """Words dropped because a robot spoke of more pairs than are kept."""
 
     def __len__(self) -> int:
         return len(self._rows)
 
     def note(self, robot: NodeName, latencies: Collection[LatencyReport], now: float) -> None:
-        """A robot reports what servers' shares of its requests were: lost are those without an answer. What came first
-        is not told: an answer counts for all of the report."""
+        """Count what a robot reports of the servers' shares of its requests: lost are those without an answer. Their
+        order is not reported, so an answer counts for the whole report."""
         answered = {(one.server, one.service) for one in latencies if one.processing.answered}
         for pair in answered:
             self._note_answer(robot, pair, now)
@@ -98,7 +98,7 @@ class Unanswered:
             self._take_back(next(iter(row.answered)), pair)
 
     def _row_with(self, robot: NodeName, pair: Pair) -> _Row:
-        """The row of a pair, in which the robot is about to stand."""
+        """Return the row of a pair that the robot is about to enter."""
         words = self._words.setdefault(robot, OrderedDict())
         words[pair] = None
         words.move_to_end(pair)
@@ -108,7 +108,7 @@ class Unanswered:
         return self._rows.setdefault(pair, _Row())
 
     def _take_back(self, robot: NodeName, pair: Pair) -> None:
-        """The robot's word on a pair does not count any more."""
+        """Discard the robot's word on a pair."""
         words = self._words[robot]
         del words[pair]
         if not words:
@@ -120,7 +120,7 @@ class Unanswered:
             del self._rows[pair]
 
     def begin(self, server: NodeName, services: Iterable[ServiceName]) -> None:
-        """Nothing is known of what serves these there: it is another process, or none."""
+        """Forget what is known of these services there: another process serves them now, or none."""
         for service in services:
             pair = (server, service)
             row = self._rows.get(pair)
@@ -129,12 +129,12 @@ class Unanswered:
                     self._take_back(robot, pair)
 
     def forget(self, robot: NodeName) -> None:
-        """The robot is gone, or was started anew: it bears witness to nothing."""
+        """Discard all words of the robot: it is gone or has restarted."""
         for pair in list(self._words.get(robot, ())):
             self._take_back(robot, pair)
 
     def row(self, server: NodeName, service: ServiceName, now: float) -> int:
-        """Requests that the server had since its last answer, and has not answered, as far as that is believed."""
+        """Return how many requests the server has left unanswered since its last answer, as far as that is believed."""
         row = self._rows.get((server, service))
         if row is None or not row.lost:
             return 0

@@ -1,9 +1,8 @@
-"""Who bore witness to what a server needs, and for how much it counts: no robot outweighs all the others.
+"""Weighs what robots report of a server's processing times: no robot outweighs all the others.
 
 What a server needs is known from all robots' reports, and one of them may be hacked, or merely odd. So a robot counts
-for as much as the busiest other one, and for a few hundred requests in any case; alone, for a thousand.
-And that a server has changed, after which what was known of it is forgotten, takes the word of two where more than one
-bears witness.
+for as much as the busiest other one, and for a few hundred requests in any case; alone, for a thousand. That a server
+has changed, after which what was known of it is forgotten, takes the word of two robots if more than one reports.
 """
 
 from __future__ import annotations
@@ -21,19 +20,19 @@ if TYPE_CHECKING:
     from protos.model.ids import NodeName
 
 MAX_WITNESSES = 64
-"""Robots remembered for each server and service, the one that reported least recently goes."""
+"""Robots remembered for each server and service; the one that reported least recently is evicted."""
 
 COUNTS_ANYWAY = 300.0
-"""For so many requests a robot counts however little the others call: misses of one in a hundred are known."""
+"""A robot counts for this many requests however little the others call: misses of one in a hundred are known."""
 
 MOST_ALONE = 1000.0
-"""For so many a robot counts where no other one has reported lately: those who come later need not wait for long."""
+"""A robot counts for this many if no other one has reported recently: robots that come later need not wait for long."""
 
 RANKS_ALIKE = 1e-6
 """Ranks closer than this may differ by rounding alone."""
 
 LATELY_S = 5.0
-"""Who reported within this time bears witness now: robots report once a second or so."""
+"""A robot that reported within this time is a witness now: robots report once a second or so."""
 
 
 class Witnesses:
@@ -45,13 +44,13 @@ class Witnesses:
         self._half_life_s = half_life_s
         self._counts: OrderedDict[NodeName, FadedCount] = OrderedDict()
         self._ranks: dict[NodeName, float] = {}
-        """By which they count for more or less, whatever the time: see `FadedCount.rank`."""
+        """Ranks by which they count for more or less at any time: see `FadedCount.rank`."""
         self._heard_at: dict[NodeName, float] = {}
         self._accusers: set[NodeName] = set()
-        """Whose samples lately spoke for a change."""
+        """Robots whose recent samples spoke for a change."""
 
     def weigh(self, robot: NodeName, processing: Histogram, now: float) -> Histogram:
-        """Return of a robot's samples as many as it counts for, evenly thinned out, and note them."""
+        """Return as many of a robot's samples as it counts for, evenly thinned out, and note them."""
         count = self._counts.get(robot)
         if count is None:
             count = FadedCount(self._half_life_s, now)
@@ -71,7 +70,7 @@ class Witnesses:
         return processing if kept == samples else thinned(processing, kept)
 
     def _busiest_but(self, robot: NodeName, now: float) -> float:
-        """For how much the busiest other one counts by now."""
+        """Return how much the busiest other robot counts for by now."""
         self._ranks[robot] = -math.inf
         least = max(self._ranks.values()) - RANKS_ALIKE
         return max(
@@ -80,20 +79,20 @@ class Witnesses:
         )
 
     def accuses(self, robot: NodeName) -> None:
-        """Its samples spoke for a change."""
+        """Note that the robot's samples spoke for a change."""
         self._accusers.add(robot)
 
     def acquit(self) -> None:
-        """There was no change, or it is taken note of."""
+        """Clear the accusers: there was no change, or it has been taken into account."""
         self._accusers.clear()
 
     def agree(self, now: float) -> bool:
-        """Whether those who spoke for a change are enough to believe it."""
+        """Return whether enough robots spoke for a change to believe it."""
         lately = {name for name, at in self._heard_at.items() if now - at <= LATELY_S}
         return len(self._accusers) > 1 or lately <= self._accusers
 
     def largest_share(self, now: float) -> tuple[NodeName, float] | None:
-        """Who counts for most, and for what share of all; None without any."""
+        """Return who counts for most, and for what share of all; None without any."""
         weights = {name: count.weight(now) for name, count in self._counts.items()}
         total = sum(weights.values())
         if total <= 0.0:
@@ -106,7 +105,7 @@ class Witnesses:
 
 
 def thinned(histogram: Histogram, kept: int) -> Histogram:
-    """Return `kept` samples of a histogram, of each bucket as many as its share, rounded to the largest remainders."""
+    """Return `kept` samples of a histogram, from each bucket its share, rounded to the largest remainders."""
     if kept <= 0:
         return Histogram()
     counts = np.append(histogram.counts, histogram.lost).astype(np.float64)
