@@ -1,11 +1,11 @@
-"""Blocks of one shape stacked into arrays, so that each one's best choice at given prices is found at once.
+"""Stacks blocks of one shape into arrays, so that each one's best choice at given prices is found at once.
 
 Prices by block and server come in as an array with one column more than there are servers: the last, which is 0,
 belongs to an interface that carries no copy. A price of infinity closes a server.
 
 There are two kinds. A `SeparableStack` holds blocks whose cost is a sum over interfaces that all carry a copy. In an
-optimum an interface has one of its I cheapest servers, I being the number of interfaces: otherwise one of those is left
-by the others, and moving there is cheaper and exceeds nothing. An `EnumeratedStack` holds every choice of its blocks.
+optimum each interface has one of its I cheapest servers, I being the number of interfaces: otherwise one of these is
+left by the others, and moving there is cheaper and exceeds nothing. An `EnumeratedStack` lists every choice.
 """
 
 from __future__ import annotations
@@ -44,21 +44,21 @@ if TYPE_CHECKING:
     Indices = NDArray[np.intp]
 
 MAX_TRIED = 4
-"""Interfaces up to which the I cheapest servers of each are combined in all I^I ways; beyond, block after block is
+"""Interfaces up to which the I cheapest servers of each are combined in all I^I ways; with more, each block is
 matched."""
 
 
 class Best(NamedTuple):
-    """The best choice of each block asked for."""
+    """The best choice of each requested block."""
 
     value: Floats
-    """Cost and prices; infinite where all servers of an interface are closed."""
+    """Cost plus prices; infinite if all servers of an interface are closed."""
     excess: Indices
-    """By how many interfaces the block's own capacity is exceeded."""
+    """Number of interfaces by which the block's own capacity is exceeded."""
     picks: Indices
-    """By block, then interface: the server's index; the stack's number of servers where an interface has none."""
+    """By block, then interface: the server's index, or the stack's number of servers if the interface has none."""
     least: Floats
-    """What no choice is below, with `excess_price` for each interface in excess."""
+    """Lower bound over all choices, with `excess_price` for each interface in excess."""
 
 
 class Stack(abc.ABC):
@@ -77,29 +77,29 @@ class Stack(abc.ABC):
 
     @cached_property
     def free(self) -> Best:
-        """The best choices of all blocks where nothing has a price."""
+        """The best choices of all blocks when nothing has a price."""
         return self.best(self.every, np.zeros((len(self.blocks), self.servers + 1)))
 
     @abc.abstractmethod
     def best(self, rows: Indices, price: Floats, excess_price: float = OWN_EXCESS_PRICE) -> Best:
-        """The best choice of these blocks at these prices, of the servers and of an interface in excess."""
+        """Return the best choice of these blocks at these prices, of the servers and of an interface in excess."""
 
     @abc.abstractmethod
     def near(self, row: int, price: Floats, margin: float, at_most: int) -> Near:
-        """Choices of one block within `margin` of its best."""
+        """Return choices of one block within `margin` of its best."""
 
     def bound(self, price: Floats, best: Best, forced: Indices, excess_price: float) -> Floats:
-        """What the best of each block is worth at least, given `best` at these prices, and `excess_price` for each
+        """Return a lower bound on the best of each block, given `best` at these prices, with `excess_price` for each
         interface by which it exceeds the block's own capacity beyond what it must (`forced`)."""
         least: Floats = best.least - excess_price * forced
         return least
 
     def picks_of(self, choice: Choice) -> list[int]:
-        """A choice in this stack's numbering."""
+        """Convert a choice to this stack's numbering."""
         return [self.servers if server is None else server for server in choice]
 
     def choice_of(self, picks: Iterable[int]) -> Choice:
-        """The reverse."""
+        """Convert picks back to a choice."""
         return tuple(None if server == self.servers else int(server) for server in picks)
 
 
@@ -164,7 +164,7 @@ def _match(priced: Floats, capacity: Indices, excess_price: float) -> tuple[Floa
 class EnumeratedStack(Stack):
     """Blocks whose choices are listed: all others.
 
-    Where a block has more than `at_most` choices, only some are, and its bound comes from `path_bound`.
+    If a block has more than `at_most` choices, only some are listed, and its bound comes from `path_bound`.
     """
 
     def __init__(self, objective: Objective, blocks: Sequence[Block], limits: Limits, *, at_most: int) -> None:
@@ -176,7 +176,7 @@ class EnumeratedStack(Stack):
         self._excess = np.zeros((len(blocks), longest), dtype=np.intp)
         self._count = [len(listed.choices) for listed in lists]
         self._trimmed: dict[int, PathBound] = {}
-        """By row."""
+        """Bounds of incompletely listed blocks, by row."""
         for row, (block, (choices, complete)) in enumerate(zip(blocks, lists, strict=True)):
             count = len(choices)
             self._cost[row, :count] = choice_costs(objective, block, choices)

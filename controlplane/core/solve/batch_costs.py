@@ -1,6 +1,6 @@
-"""What choices of many blocks of one shape cost, in arrays: for blocks without a target.
+"""Computes what choices of many blocks of one shape cost, in arrays: for blocks without a target.
 
-A choice names a server for each interface, or, by the number after the last server, none.
+A choice names for each interface a server, or none by the number after the last server.
 """
 
 from __future__ import annotations
@@ -33,10 +33,10 @@ class StackedCosts:
         rows, interfaces = len(blocks), len(blocks[0].interfaces)
         self._none = servers
         self.of_path: Floats = np.full((rows, interfaces, servers + 1), np.inf)
-        """By block, interface and server, what a path adds as long as lifts are 1; infinite where there is none, and
-        for an interface without a copy where each must carry one."""
+        """By block, interface and server: what a path adds while lifts are 1; infinite if there is no path, and for an
+        interface without a copy if each must carry one."""
         self.region: Indices = np.full((rows, servers + 1), -1)
-        """By block and server, numbered; -1 where it is not known or copies need not care."""
+        """By block and server: the region's number; -1 if it is unknown or copies need not care."""
         self._carrier: Indices = np.full((rows, interfaces), -1)
         self._capacity = np.array([block.capacity or interfaces for block in blocks])
         for row, block in enumerate(blocks):
@@ -66,24 +66,24 @@ class StackedCosts:
         return found
 
     def log_lifts(self, row: Indices, i: int, j: Indices, k: int, m: Indices) -> Floats:
-        """Of pairs of paths, (i, j) and (k, m) with i < k; the arrays are combined as numpy does."""
+        """Return the log lifts of pairs of paths, (i, j) and (k, m) with i < k; the arrays broadcast as in numpy."""
         wanted = self._code(row, i, j, k, m)
         at = np.minimum(np.searchsorted(self._codes, wanted), len(self._codes) - 1)
         found: Floats = np.where(self._codes[at] == wanted, self._log_lifts[at], 0.0)
         return found
 
     def excess(self, rows: Indices, picks: Indices) -> Indices:
-        """By how many interfaces these choices, one for each of the rows, exceed the blocks' own capacities."""
+        """Return by how many interfaces these choices, one for each row, exceed the blocks' own capacities."""
         return repeats(np.where(picks == self._none, -1, picks), self._capacity[rows])
 
     def crowded_server(self, rows: Indices, picks: Indices) -> Indices:
-        """One that too many interfaces of each of these choices are on."""
+        """Return for each choice a server that carries too many of its interfaces."""
         crowd = beyond(np.where(picks == self._none, -1, picks), self._capacity[rows])
         found: Indices = picks[np.arange(len(picks)), crowd.argmax(axis=1)]
         return found
 
     def cost(self, rows: Indices, picks: Indices) -> Floats:
-        """`costs.block_cost` of these choices, one for each of the rows; infinite where a path does not exist."""
+        """Return `costs.block_cost` of these choices, one for each row; infinite if a path does not exist."""
         singles = np.take_along_axis(self.of_path[rows], picks[:, :, None], 2)[:, :, 0]
         total: Floats = singles.sum(axis=1)
         if self.has_lifts:
@@ -102,5 +102,5 @@ class StackedCosts:
         return repeats(regions, np.array(1)) + repeats(np.where(there, self._carrier[rows], -1), np.array(1))
 
     def carriers_shared(self, there: NDArray[np.bool_]) -> Indices:
-        """By block, then by row of `there` (which interfaces carry a copy): how many share a carrier."""
+        """Return by block, then by row of `there` (which interfaces carry a copy), how many share a carrier."""
         return repeats(np.where(there, self._carrier[:, None, :], -1), np.array(1))

@@ -1,12 +1,12 @@
-"""A good plan for many blocks that share servers, and a bound below which none is.
+"""Finds a good plan for many blocks that share servers, and a lower bound for all plans.
 
 Lagrangian relaxation of the limits over all robots. Each limit gets a price; at given prices the blocks are
-independent, and each takes its best choice (`stacks`). The sum of what these are worth, less the prices of the
+independent, and each takes its best choice (`batch`). The sum of these choices' values, less the prices of the
 capacities, is below the cost of every plan that keeps to the limits. Prices move along the subgradient, the excess
-load, by Polyak's step towards the best plan known; plans come from the blocks' choices by moving blocks away from
-where there is no room (`standing`).
+load, by Polyak's step towards the best plan known. Plans come from the blocks' choices by moving blocks away from where
+there is no room (`incumbent`).
 
-Where the best plan known exceeds capacities by E more interfaces than the blocks must by themselves, an interface in
+If the best plan known exceeds capacities by E more interfaces than the blocks must by themselves, an interface in
 excess has a price too, which no price of a limit is above: the bound then holds for plans that exceed by no more.
 """
 
@@ -39,9 +39,9 @@ if TYPE_CHECKING:
 
 MAX_STEPS = 300
 STEPS_BETWEEN_PLANS = 12
-"""A plan costs as much as some steps."""
+"""Steps between plans: a plan costs as much as some steps."""
 PATIENCE_STEPS = 8
-"""Steps without a better bound before they become half as long."""
+"""Steps without a better bound before the step length is halved."""
 SHORTEST_STEP = 1e-3
 
 MAX_LISTED_ALL = 4_000_000
@@ -55,7 +55,7 @@ MAX_PATTERNS_ALL = 16_000_000
 """Patterns of all blocks together (some 10 bytes each)."""
 
 MAX_PATTERN_INTERFACES = 12
-"""With more there would be a single pattern."""
+"""With more interfaces there would be a single pattern."""
 
 
 class Kind(enum.Enum):
@@ -67,7 +67,7 @@ class Kind(enum.Enum):
 
 
 def stack_blocks(objective: Objective, blocks: Sequence[Block], limits: Limits) -> list[Stack]:
-    """Stack blocks of one shape and kind."""
+    """Stack blocks by shape and kind."""
     listed = [block for block in blocks if block.idempotent and not _adds_up(objective, block)]
     at_most = min(MAX_LISTED, max(MIN_LISTED, MAX_LISTED_ALL // max(1, len(listed))))
     shapes: dict[tuple[Kind, bool, int], list[Block]] = {}
@@ -98,7 +98,7 @@ def _kind(objective: Objective, block: Block, at_most: int) -> Kind:
 
 
 def _adds_up(objective: Objective, block: Block) -> bool:
-    """Whether the block's cost is a sum over its interfaces, which all carry a copy."""
+    """Return whether the block's cost is a sum over its interfaces, which all carry a copy."""
     if not block.idempotent or block.target is not None or chooses_interfaces(block):
         return False
     return not (objective is Objective.JOINT and block.lifts) and not has_shared_regions(block)
@@ -111,15 +111,15 @@ class Relaxed:
     standing: Standing
     bound: float
     price: Floats
-    """By limit; one more at the end, 0."""
+    """Prices by limit; one more at the end, 0."""
     extra: int
-    """By how many interfaces it exceeds capacities beyond what each block must by itself."""
+    """Number of interfaces by which it exceeds capacities beyond what each block must by itself."""
     excess_proven: bool
     """Whether no plan exceeds capacities by less."""
 
 
 class Decomposition:
-    """One group of blocks."""
+    """Solves one group of blocks."""
 
     def __init__(self, problem: Problem, limits: Limits, prices: Mapping[FleetKey, float]) -> None:
         self.limits = limits
@@ -148,7 +148,7 @@ class Decomposition:
         return Relaxed(self._best, self._bound, self._price, max(0, self._extra()), self._is_excess_proven())
 
     def worth(self, price: Floats) -> dict[BlockKey, float]:
-        """What each block's best choice is worth at least at these prices of the limits."""
+        """Return a lower bound on each block's best choice at these prices of the limits."""
         found: dict[BlockKey, float] = {}
         for stack in self.stacks:
             prices = price[stack.limit]
@@ -185,9 +185,9 @@ class Decomposition:
         return self._best.excess - self._forced_all
 
     def _dual(self, price: Floats) -> tuple[float, list[Best]]:
-        """What no plan is below that exceeds capacities by no more than the best one known."""
+        """Return a lower bound on all plans that exceed capacities by no more than the best one known."""
         extra = self._extra()
-        # Where the limits alone force that much excess, no such plan exceeds a block's own capacity.
+        # If the limits alone force that much excess, no such plan exceeds a block's own capacity.
         excess_price = OWN_EXCESS_PRICE if self._is_excess_proven() else float(price.max())
         total = -float(price[:-1] @ self.limits.capacity) - max(0, extra) * float(price.max())
         found = []
@@ -219,7 +219,7 @@ class Decomposition:
         return self._is_excess_proven() and relative_gap(self._best.cost, self._bound, self._best.size) <= good_gap
 
     def _is_excess_proven(self) -> bool:
-        """Whether nothing is exceeded beyond what each block must by itself, or everything is full and more is
+        """Return whether nothing is exceeded beyond what each block must by itself, or everything is full and more is
         wanted."""
         extra = self._extra()
         if extra <= 0:

@@ -1,4 +1,4 @@
-"""Choices of a block as arrays: a row each, of the index of the server of each interface."""
+"""Represents choices of a block as arrays: each row holds the index of the server of each interface."""
 
 from __future__ import annotations
 
@@ -21,20 +21,20 @@ if TYPE_CHECKING:
     Indices = NDArray[np.intp]
 
 OWN_EXCESS_PRICE = 1e6
-"""Of an interface beyond the block's own capacity: more than any cost and any price of a server."""
+"""Price of an interface beyond the block's own capacity: more than any cost and any price of a server."""
 
 
 MOST_DIMENSIONS = 32
-"""Of numpy's arrays, by some of its functions."""
+"""Limit on the dimensions of numpy's arrays, by some of its functions."""
 
 MAX_LISTED = 4096
-"""Choices looked at of one block: 2 interfaces with 64 servers, 3 with 16, 4 with 8."""
+"""Choices examined of one block: 2 interfaces with 64 servers, 3 with 16, 4 with 8."""
 
 TRIED_A_CHOICE = 16
-"""Combinations of cheap servers that are looked at for each choice wanted near a block's best."""
+"""Combinations of cheap servers examined for each choice wanted near a block's best."""
 
 CHOICES_A_WAY = 4
-"""Choices there should be room for, at least, for each set of interfaces that carries copies."""
+"""Minimum room in choices for each set of interfaces that carries copies."""
 
 
 class Near(NamedTuple):
@@ -49,19 +49,19 @@ class Near(NamedTuple):
 
 @lru_cache(maxsize=64)
 def combinations(interfaces: int, options: int) -> Indices:
-    """Every way to give each interface one of `options`."""
+    """Return every way to give each interface one of `options`."""
     return np.indices((options,) * interfaces, dtype=np.intp).reshape(interfaces, -1).T.copy()
 
 
 def own_excess(block: Block, choices: Indices) -> Indices:
-    """`problem.block_excess` of many choices, a row each."""
+    """Return `problem.block_excess` of many choices, one per row."""
     if not block.capacity or not block.idempotent or block.target is not None:
         return np.zeros(len(choices), dtype=np.intp)
     return repeats(choices, np.array(block.capacity))
 
 
 class Listed(NamedTuple):
-    """Choices of one block."""
+    """Listed choices of one block."""
 
     choices: Indices
     complete: bool
@@ -69,10 +69,10 @@ class Listed(NamedTuple):
 
 
 def list_choices(block: Block, at_most: int) -> Listed:
-    """The block's choices, -1 where an interface carries no copy.
+    """List the block's choices, -1 where an interface carries no copy.
 
-    Of more than `at_most`, those among the most promising servers of each interface; where even the ways to leave
-    interfaces out are too many, those that leave out the worst.
+    If there are more than `at_most`, list those among the most promising servers of each interface. If even the ways to
+    leave interfaces out are too many, list those that leave out the worst.
     """
     epsilon = epsilon_matrix(block)
     there = ~np.isnan(epsilon)
@@ -89,7 +89,7 @@ def list_choices(block: Block, at_most: int) -> Listed:
 
 
 def _list_single(block: Block, epsilon: Floats, at_most: int) -> Listed:
-    """One server, over as many of the interfaces that reach it as are wanted."""
+    """List choices of one server, over as many of the interfaces that reach it as are wanted."""
     lists = []
     complete = True
     servers = np.flatnonzero(~np.isnan(epsilon).all(axis=0))
@@ -104,7 +104,7 @@ def _list_single(block: Block, epsilon: Floats, at_most: int) -> Listed:
 
 
 def _ways(block: Block, epsilon: Floats, usable: Indices, at_most: int) -> tuple[list[list[int]], bool]:
-    """The sets of interfaces that may carry copies, of those usable; all, or if these are too many, the best of each
+    """Return the sets of usable interfaces that may carry copies: all, or, if these are too many, the best of each
     size."""
     least, most = block.copies_wanted
     sizes = range(min(least, len(usable)), min(most, len(usable)) + 1)
@@ -115,8 +115,8 @@ def _ways(block: Block, epsilon: Floats, usable: Indices, at_most: int) -> tuple
 
 
 def _promising(block: Block, interface: int, servers: Indices, share: int) -> Indices:
-    """So many of an interface's servers: in turn the one with the least epsilon, the one with the least in another
-    region, and, where charges count, the cheapest."""
+    """Return up to `share` of an interface's servers: in turn the one with the least epsilon, the one with the least in
+    another region, and, if charges count, the cheapest."""
     if len(servers) <= share:
         return servers
     best_first = sorted(servers.tolist(), key=lambda server: block.epsilon[interface][server] or 0.0)
@@ -132,7 +132,7 @@ def _promising(block: Block, interface: int, servers: Indices, share: int) -> In
 
 
 def _all_of(way: list[int], options: list[Indices]) -> Indices:
-    """Every way to give the interfaces named one of their options, and the others none."""
+    """Return every way to give the named interfaces one of their options, and the others none."""
     if len(way) > MOST_DIMENSIONS:
         rows = np.array(list(itertools.product(*(options[i] for i in way))), dtype=np.intp)
         choices = np.full((len(rows), len(options)), -1, dtype=np.intp)
@@ -146,7 +146,7 @@ def _all_of(way: list[int], options: list[Indices]) -> Indices:
 
 
 def lift_floor(block: Block) -> float:
-    """What all lifts of a choice together add at least to the logarithm of its miss probability; at most 0."""
+    """Return the least that all lifts of a choice together add to the logarithm of its miss probability; at most 0."""
     least: dict[tuple[int, int], float] = {}
     for ((i, _), (k, _)), lift in block.lifts.items():
         least[i, k] = min(least.get((i, k), 0.0), log_lift(lift))
@@ -154,14 +154,14 @@ def lift_floor(block: Block) -> float:
 
 
 def tried_of_each(interfaces: int, at_most: int) -> int:
-    """Of how many servers of each interface the combinations are looked at for so many choices near the best."""
+    """Return how many servers of each interface to combine, to find `at_most` choices near the best."""
     return max(1, int(min(MAX_LISTED, TRIED_A_CHOICE * at_most) ** (1 / interfaces) + 1e-9))
 
 
 def nearest(values: Floats, excess: Indices, picks: Indices, margin: float, at_most: int, *, complete: bool) -> Near:
-    """Of these choices of one block those within `margin` of the best, the best first.
+    """Return the choices of one block that are within `margin` of the best, the best first.
 
-    With an infinite margin also those that exceed the block's own capacity by more than need be.
+    With an infinite margin, include those that exceed the block's own capacity more than necessary.
     """
     rank = values + OWN_EXCESS_PRICE * excess
     order = np.argsort(rank, kind="stable")

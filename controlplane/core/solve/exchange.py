@@ -1,7 +1,7 @@
-"""Moves of two blocks at once: one leaves a full server at a small loss, so that another gains more by coming.
+"""Moves two blocks at once: one leaves a full server at a small loss, so that another gains more by coming.
 
-Where many servers are as good as each other, as with estimates that measured no miss yet, moves of single blocks end
-far from the best: who sits where others would gain has no reason of its own to leave.
+If many servers are equally good, as with estimates that have measured no miss yet, moves of single blocks end far from
+the best: a block that sits where others would gain has no reason of its own to leave.
 """
 
 from __future__ import annotations
@@ -21,14 +21,14 @@ if TYPE_CHECKING:
     Indices = NDArray[np.intp]
 
 MAX_ROUNDS = 30
-"""Times that all blocks are looked at; each but the last saves something."""
+"""Passes over all blocks; each but the last saves something."""
 
 MIN_GAIN = 1e-9
-"""What a trade must save."""
+"""Minimum saving of a trade."""
 
 
 class Move(NamedTuple):
-    """A block's other choice."""
+    """A block's alternative choice."""
 
     stack: int
     row: int
@@ -40,7 +40,7 @@ class Move(NamedTuple):
 
 
 def trade(standing: Standing, out_of_time: Callable[[], bool]) -> None:
-    """Trade until nothing is gained by it."""
+    """Trade until that gains nothing."""
     for _ in range(MAX_ROUNDS):
         if out_of_time() or not _round(standing):
             return
@@ -65,7 +65,7 @@ def _round(standing: Standing) -> bool:
 
 
 def _wishes(standing: Standing, full: NDArray[np.bool_]) -> dict[int, list[Move]]:
-    """By full limit: the blocks that would gain by coming, did not exactly this one stand in the way."""
+    """Return by full limit the blocks that would gain by coming if exactly this limit were not in the way."""
     found: dict[int, list[Move]] = {}
     for number, (stack, part) in enumerate(zip(standing.stacks, standing.parts, strict=True)):
         best = stack.free
@@ -83,7 +83,7 @@ def _wishes(standing: Standing, full: NDArray[np.bool_]) -> dict[int, list[Move]
 
 
 def _leaving(standing: Standing, wanted: NDArray[np.bool_], full: NDArray[np.bool_]) -> dict[int, list[Move]]:
-    """By wanted limit: the blocks under it, and what the best costs them that is neither there nor at a full one."""
+    """Return by wanted limit the blocks under it, with the cost of their best choice outside it and any full one."""
     found: dict[int, list[Move]] = {}
     for number, (stack, part) in enumerate(zip(standing.stacks, standing.parts, strict=True)):
         used = np.take_along_axis(stack.limit, part.picks, 1)
@@ -91,7 +91,7 @@ def _leaving(standing: Standing, wanted: NDArray[np.bool_], full: NDArray[np.boo
         if not rows.size:
             continue
         own = (part.picks[rows][:, :, None] == np.arange(stack.servers + 1)).any(axis=1)
-        # It may stay at a full server that nobody wants, and go to none that is full.
+        # It may stay at a full server that nobody wants, but not go to a full one.
         shut = wanted[stack.limit[rows]] | (full[stack.limit[rows]] & ~own)
         shut[:, stack.servers] = False
         best = stack.best(rows, np.where(shut, np.inf, 0.0))

@@ -1,6 +1,6 @@
-"""Choices for all blocks of a group, in arrays, and how single blocks move to better ones.
+"""Holds choices for all blocks of a group, in arrays, and moves single blocks to better ones.
 
-A move is taken if it exceeds the capacities by less in all, or by as much at less cost. So a standing only improves.
+A move is taken if it exceeds the capacities by less in total, or by as much at less cost. So a standing only improves.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ MIN_GAIN = 1e-12
 """Costs closer than this are equal: rounding."""
 
 MAX_SWEEPS = 40
-"""Passes over all blocks: each ends some excess or saves some cost, or is the last."""
+"""Passes over all blocks: each removes some excess or saves some cost, or is the last."""
 
 
 @dataclass(slots=True)
@@ -58,7 +58,7 @@ class Standing:
 
     @classmethod
     def of_best(cls, stacks: Sequence[Stack], limits: Limits, price: Floats, best: Sequence[Best]) -> Standing:
-        """The blocks' best choices at these prices of the limits."""
+        """Take the blocks' best choices at these prices of the limits."""
         parts = []
         for stack, found in zip(stacks, best, strict=True):
             paid = price[np.take_along_axis(stack.limit, found.picks, 1)].sum(axis=1)
@@ -69,7 +69,7 @@ class Standing:
     def of_choices(
         cls, objective: Objective, stacks: Sequence[Stack], limits: Limits, choices: Mapping[BlockKey, Choice]
     ) -> Standing:
-        """These choices, one for every block."""
+        """Take these choices, one for every block."""
         parts = []
         for stack in stacks:
             chosen = [choices[block.key] for block in stack.blocks]
@@ -85,26 +85,26 @@ class Standing:
 
     @property
     def cost(self) -> float:
-        """Of all blocks."""
+        """Cost of all blocks."""
         return float(sum(part.cost.sum() for part in self.parts))
 
     @property
     def size(self) -> float:
-        """Of the cost of all blocks, as `plan.size` has it."""
+        """Size of the cost of all blocks, as defined by `plan.size`."""
         return sum(size(part.cost) for part in self.parts)
 
     @property
     def excess(self) -> int:
-        """By how many interfaces capacities are exceeded: the blocks' own, and those over all robots."""
+        """Number of interfaces by which capacities are exceeded: the blocks' own, and those over all robots."""
         own = sum(int(part.excess.sum()) for part in self.parts)
         return own + int(np.maximum(0, self.load - self.limits.capacity).sum())
 
     def is_better_than(self, other: Standing) -> bool:
-        """Whether it exceeds less, or as much at less cost."""
+        """Return whether it exceeds less, or as much at less cost."""
         return (self.excess, self.cost) < (other.excess, other.cost)
 
     def choices(self) -> dict[BlockKey, Choice]:
-        """By block."""
+        """Return the choices by block."""
         return {
             block.key: stack.choice_of(picks)
             for stack, part in zip(self.stacks, self.parts, strict=True)
@@ -112,8 +112,8 @@ class Standing:
         }
 
     def settle(self, price: Floats, out_of_time: Callable[[], bool]) -> None:
-        """Move blocks away from limits that are exceeded, those first that lose least at these prices, and that even
-        out of time; then to what is cheaper for them, within the limits; then two at a time."""
+        """Move blocks away from exceeded limits, first those that lose least at these prices, even when out of time.
+        Then move blocks to what is cheaper for them, within the limits; then two at a time."""
         for _ in range(MAX_SWEEPS):
             if not self._sweep(price, crowded_only=True):
                 break
@@ -124,7 +124,7 @@ class Standing:
         trade(self, out_of_time)
 
     def exchange(self, goer: Move, comer: Move) -> bool:
-        """Make both moves if they cost less together and exceed no more; False if not."""
+        """Make both moves if together they cost less and exceed no more; return False if not."""
         if (goer.stack, goer.row) == (comer.stack, comer.row):
             return False
         part = self.parts[goer.stack]
@@ -147,7 +147,7 @@ class Standing:
             rows = np.flatnonzero(is_crowded) if crowded_only else stack.every
             if not rows.size:
                 continue
-            # One that sits where there is no room may move to where there is none either: nothing is exceeded more.
+            # A block that sits where there is no room may move to where there is none either: no excess is added.
             shut = self._shut(stack, part, rows) & (~is_crowded[rows, None] | crowded_only)
             found = stack.best(rows, np.where(shut, np.inf, price[stack.limit[rows]]))
             now = part.cost[rows] + price[used[rows]].sum(axis=1)
@@ -164,7 +164,7 @@ class Standing:
         return sum(self._move(*move[1:]) for move in moves) > 0
 
     def _shut(self, stack: Stack, part: Part, rows: Indices) -> NDArray[np.bool_]:
-        """Servers that have no room for one more interface of each block, its own not counted."""
+        """Return the servers without room for one more interface of each block, not counting its own."""
         room = np.append(self.limits.capacity - self.load, np.iinfo(np.int32).max)
         own = (part.picks[rows][:, :, None] == np.arange(stack.servers + 1)).sum(axis=1)
         shut: NDArray[np.bool_] = room[stack.limit[rows]] + own <= 0

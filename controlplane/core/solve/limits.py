@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 
 class Limits:
-    """Numbers the limits of a problem; the number after the last stands for "no limit"."""
+    """Numbers of a problem's limits; the number after the last stands for "no limit"."""
 
     def __init__(self, problem: Problem) -> None:
         self.keys: tuple[FleetKey, ...] = tuple(problem.fleet_capacity)
@@ -30,12 +30,12 @@ class Limits:
         return len(self.keys)
 
     def of_block(self, block: Block) -> list[int]:
-        """The number of each server's limit."""
+        """Return the number of each server's limit."""
         service, without = block.key.service, len(self.keys)
         return [self._number.get(FleetKey(server, service), without) for server in block.servers]
 
     def loads(self, limits_used: Sequence[NDArray[np.intp]]) -> NDArray[np.int64]:
-        """Interfaces held by each limit, given the limit that each interface falls under."""
+        """Return how many interfaces each limit holds, given the limit that each interface falls under."""
         count = np.zeros(len(self.keys) + 1, dtype=np.int64)
         for used in limits_used:
             count += np.bincount(used.ravel(), minlength=len(self.keys) + 1)

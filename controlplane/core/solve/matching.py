@@ -1,7 +1,7 @@
-"""Interfaces to servers at the least cost, each server taking a few: the assignment problem proper.
+"""Assigns interfaces to servers at the least cost, each server taking a few: the assignment problem proper.
 
-Shortest augmenting paths with potentials (Kuhn's Hungarian method in Jonker and Volgenant's order): row after row, the
-cheapest way to make room for it.
+Shortest augmenting paths with potentials (Kuhn's Hungarian method in Jonker and Volgenant's order): for one row after
+the other, the cheapest way to make room is found.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ NO_PATH_COST = 1e12
 
 
 def cheapest_matching(costs: NDArray[np.float64], slots: int, excess_price: float) -> list[int]:
-    """The server of each interface, where `slots` interfaces fit a server and each one more costs `excess_price`."""
+    """Return each interface's server; `slots` interfaces fit a server, and each further one costs `excess_price`."""
     interfaces, servers = costs.shape
     finite = np.where(np.isinf(costs), NO_PATH_COST, costs)
     within = min(slots, interfaces)
@@ -33,7 +33,7 @@ def cheapest_matching(costs: NDArray[np.float64], slots: int, excess_price: floa
 
 
 def forced_excess(block: Block) -> int:
-    """By how many interfaces a block exceeds its own capacity at least."""
+    """Return by how many interfaces a block at least exceeds its own capacity."""
     interfaces = len(block.interfaces)
     if not block.capacity or min(len(reachable(row)) for row in block.epsilon) * block.capacity >= interfaces:
         return 0
@@ -44,7 +44,7 @@ def forced_excess(block: Block) -> int:
 
 
 def cheapest_columns(costs: NDArray[np.float64]) -> list[int]:
-    """A column of its own for each row, at the least sum; there are no fewer columns than rows."""
+    """Assign each row a column of its own at the least sum; there are no fewer columns than rows."""
     rows, columns = costs.shape
     row_potential, column_potential = np.zeros(rows), np.zeros(columns)
     row_of = np.full(columns, -1)

@@ -1,4 +1,4 @@
-"""What no choice of a block costs less than, path by path: where a block has too many choices to list them all."""
+"""Bounds the cost of a block's choices from below, path by path, when there are too many choices to list."""
 
 from __future__ import annotations
 
@@ -21,19 +21,19 @@ if TYPE_CHECKING:
     Floats = NDArray[np.float64]
 
 RELIABILITY_PRICES = np.array([0.0, *(2.0**power for power in range(-9, 5))])
-"""Of a unit of the logarithm of the miss probability, in shares of the largest charge: tried one by one."""
+"""Prices of one unit of the logarithm of the miss probability, in shares of the largest charge: tried one by one."""
 
 
 def path_bound(objective: Objective, block: Block) -> PathBound:
-    """The bound for a block."""
+    """Return the bound for a block."""
     return PathBound(objective, block) if block.target is None else _TargetBound(block, block.target)
 
 
 class PathBound:
-    """The cost is no less than the sum of what paths cost by themselves, what lifts below 1 take off, and what copies
-    that outnumber the domains cost.
+    """The cost is at least the sum of the paths' own costs, what lifts below 1 take off, and the cost of copies that
+    outnumber the domains.
 
-    Each interface takes its cheapest server, and as few or as many carry copies as may and pays best.
+    Each interface takes its cheapest server, and the number of copies is the allowed one that pays best.
     """
 
     def __init__(self, objective: Objective, block: Block) -> None:
@@ -45,15 +45,15 @@ class PathBound:
         self._rest = lift_floor(block) if objective is Objective.JOINT else 0.0
 
     def at(self, price: Floats, forced: int, excess_price: float) -> float:
-        """At these prices of the servers, and of an interface in excess beyond those `forced`."""
+        """Return the bound at these prices of the servers, and of an interface in excess beyond those `forced`."""
         interfaces, servers = self._costs.shape
         gains = (self._costs + price[:servers]).min(axis=1) - self._none
-        # A copy that crowds a server shares no domain: whichever is cheaper.
+        # A copy that crowds a server shares no domain: the cheaper of the two counts.
         shared = min(RULE_PRICE, excess_price) * max(0, self._shared - forced)
         return float(self._none * interfaces + self._sum(gains) + self._rest + shared)
 
     def _sum(self, gains: Floats) -> Floats:
-        """The least sum of as many of these, along the last dimension, as there may be copies."""
+        """Return the least sum, along the last dimension, over the allowed numbers of copies."""
         ordered = np.sort(gains)
         always = ordered[..., : self._least].sum(axis=-1)
         total: Floats = always + np.minimum(ordered[..., self._least : self._most], 0.0).sum(axis=-1)
@@ -61,15 +61,15 @@ class PathBound:
 
 
 class _TargetBound(PathBound):
-    """Of a block with a target: a Lagrangian relaxation of it, or, where no set of paths can meet it, what missing it
-    costs at least."""
+    """Bound of a block with a target: a Lagrangian relaxation, or, if no set of paths can meet the target, the minimum
+    cost of missing it."""
 
     def __init__(self, block: Block, target: Target) -> None:
         super().__init__(Objective.JOINT, block)
         charges = np.array(target.charges) / largest_charge(block)
         self._charges = np.where(np.isinf(self._costs), np.inf, charges)
         self._logs = np.where(np.isinf(self._costs), 0.0, self._costs)
-        # What the paths' logarithms have to come to for the target to be met.
+        # What the paths' logarithms must sum to for the target to be met.
         self._enough = math.log(target.miss) + TARGET_TOLERANCE - self._rest
         self._missed = RULE_PRICE * 4 * len(block.interfaces)
         best = float(self._sum(self._costs.min(axis=1)))

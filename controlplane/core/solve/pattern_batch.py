@@ -1,8 +1,8 @@
-"""Blocks with too many choices to list them: the best choice of each by patterns of server groups.
+"""Finds the best choice of blocks with too many choices to list, by patterns of server groups.
 
-At given prices the best server of each group is taken (`server_groups`), and the best of all patterns. Where that puts
-more interfaces on a server than the block's own capacity allows, it is branched: one of these interfaces may not go
-there, for each of them in turn. What the best pattern is worth is a bound; it is what the choice is worth but where
+At given prices, the best server of each group is taken (`server_groups`), and then the best of all patterns. If that
+puts more interfaces on a server than the block's own capacity allows, the search branches: for each of these interfaces
+in turn, that one may not go there. The best pattern's value is a bound. It is what the choice is worth, except where
 lifts above 1 are capped (`objectives`), and where servers share a group that are not alike.
 """
 
@@ -44,11 +44,11 @@ MAX_BRANCHINGS = 6
 """Rounds in which interfaces are kept from servers; each is for fewer blocks."""
 
 MAX_OPEN, MIN_OPEN = 64, 8
-"""Choices of one block that are branched in one round, and of how many there is room for in any case: the others stay
+"""Limit on the choices of one block that are branched in one round, and how many have room in any case. The others stay
 as they are, and their bound with them."""
 
 MAX_OPEN_ALL = 16_384
-"""The same, of all blocks together; with 8 interfaces each makes 8 more."""
+"""The same for all blocks together; with 8 interfaces each makes 8 more."""
 
 MIN_GAIN = 1e-12
 """Values closer than this are equal: rounding."""
@@ -77,7 +77,7 @@ class PatternStack(Stack):
             self._may_cap |= (table > 0).any(axis=(1, 2))
 
     def _lift_tables(self) -> dict[tuple[int, int], Floats]:
-        """By pair of interfaces: of each block, the logarithms of the lifts between groups."""
+        """Return by pair of interfaces the logarithms of the lifts between groups, for each block."""
         single, count = self._groups.single, self._groups.count
         rows, alone = self.every[:, None, None], single.shape[2]
         tables = {}
@@ -91,7 +91,7 @@ class PatternStack(Stack):
         return tables
 
     def _pattern_costs(self) -> Floats:
-        """By block and pattern: what it costs beside the paths."""
+        """Return what each pattern costs besides the paths, by block and pattern."""
         count = self._groups.count
         found = np.zeros((len(self.blocks), *([count] * self.interfaces)))
         for (i, k), table in self._lifts.items():
@@ -140,8 +140,8 @@ class PatternStack(Stack):
         return found
 
     def _together(self, rows: Indices, picks: Indices, excess_price: float) -> Floats:
-        """What it costs at least, beside the bound, not to keep apart those that are too many on a server: that they
-        are one more, but for the region that they share."""
+        """Return the minimum cost, beside the bound, of not separating the interfaces that are too many on a server:
+        one more in excess, less the region that they share."""
         crowded = self._costs.crowded_server(rows, picks)
         waived = np.where(self._costs.region[rows, crowded] >= 0, min(RULE_PRICE, excess_price), 0.0)
         found: Floats = np.where(self._forced[rows] > 0, 0.0, excess_price - waived)
@@ -150,7 +150,7 @@ class PatternStack(Stack):
     def _kept_apart(
         self, rows: Indices, priced: Floats, owner: Indices, picks: Indices, which: NDArray[np.bool_]
     ) -> tuple[Floats, Indices]:
-        """For a server that too many interfaces are on, once for each of them: that one may not go there."""
+        """Branch once for each interface on a crowded server: that one may not go there."""
         nodes = np.flatnonzero(which)
         crowded = self._costs.crowded_server(rows[owner[nodes]], picks[nodes])
         node, interface = np.nonzero(picks[nodes] == crowded[:, None])
@@ -159,8 +159,8 @@ class PatternStack(Stack):
         return apart, owner[nodes[node]]
 
     def _relaxed(self, rows: Indices, priced: Floats, price: Floats, excess_price: float) -> tuple[Floats, Indices]:
-        """What the best pattern is worth, with the excess that the block cannot help, and its servers, of which some
-        may have to be kept apart."""
+        """Return the value of the best pattern, with the block's unavoidable excess, and its servers, some of which may
+        have to be kept apart."""
         of_groups = self._groups.priced(rows, priced)
         least = np.empty(len(rows))
         pattern = np.empty(len(rows), dtype=np.intp)
@@ -184,7 +184,7 @@ class PatternStack(Stack):
         return least + self._groups.floor[rows] + self._forced[rows] * (excess_price - waived), picks
 
     def _capped(self, rows: Indices, of_groups: Floats, price: Floats, rule_price: float) -> Floats:
-        """What a choice costs at least of which a single path, or a pair of paths, is all that counts."""
+        """Return the minimum cost of a choice in which only a single path, or a pair of paths, counts."""
         cheapest = np.where(self._least_copies[rows] < self.interfaces, 0.0, price[:, : self.servers].min(axis=1))
         least = of_groups.min(axis=(1, 2)) + (self.interfaces - 1) * cheapest
         for (i, k), table in self._lifts.items():
@@ -195,7 +195,7 @@ class PatternStack(Stack):
 
     def near(self, row: int, price: Floats, margin: float, at_most: int) -> Near:
         priced = self._costs.of_path[row] + price
-        # The best is always among them: it keeps servers apart that are the cheapest of several interfaces.
+        # The best is always included: it separates interfaces that share a cheapest server.
         best = self.best(np.array([row]), price[None]).picks
         picks = np.unique(np.concatenate([best, self._near_picks(row, priced, at_most)]), axis=0)
         rows = np.full(len(picks), row)
@@ -203,8 +203,8 @@ class PatternStack(Stack):
         return nearest(values, self._costs.excess(rows, picks), picks, margin, at_most, complete=False)
 
     def _near_picks(self, row: int, priced: Floats, at_most: int) -> Indices:
-        """For each set of interfaces that may carry the copies every way to take one of the cheapest servers of each;
-        where these sets are too many, those of the interfaces that cost least."""
+        """For each set of interfaces that may carry the copies, return every way to take one of the cheapest servers of
+        each. If there are too many sets, use those of the cheapest interfaces."""
         tried = min(MAX_LISTED, TRIED_A_CHOICE * at_most)
         ways = self._ways(row, priced, tried)
         share = max(1, min(self.servers, max(tried_of_each(len(way), at_most) for way in ways)))
@@ -220,7 +220,7 @@ class PatternStack(Stack):
         return np.concatenate(found)
 
     def _ways(self, row: int, priced: Floats, at_most: int) -> list[list[int]]:
-        """The sets of interfaces that may carry copies; of too many, the cheapest of each size."""
+        """Return the sets of interfaces that may carry copies; if too many, the cheapest of each size."""
         sizes = range(max(1, int(self._least_copies[row])), int(self._most_copies[row]) + 1)
         if sum(math.comb(self.interfaces, size) for size in sizes) <= at_most:
             return [list(way) for size in sizes for way in itertools.combinations(range(self.interfaces), size)]
@@ -229,7 +229,7 @@ class PatternStack(Stack):
 
 
 def _most_promising(open_: NDArray[np.bool_], owner: Indices, least: Floats, at_most: int) -> NDArray[np.bool_]:
-    """Of the open ones of each owner those `at_most` that are worth least."""
+    """Mark for each owner the `at_most` open ones of least value."""
     nodes = np.flatnonzero(open_)
     if len(nodes) <= at_most:
         return open_

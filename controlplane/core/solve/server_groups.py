@@ -1,12 +1,12 @@
-"""Servers that are alike to a block but for what the paths to them cost.
+"""Groups servers that are alike to a block except for what the paths to them cost.
 
 For each interface the servers fall into groups. A *single* holds one server whose paths have lifts, or stands for no
 copy; a *multi* holds all other servers of one region, or those whose region does not matter. A pattern is a group for
 each interface. Which server of a group is taken depends on paths' costs and prices alone, so a block's best choice is
-found among some hundred patterns where there are millions of choices.
+found among some hundred patterns instead of millions of choices.
 
-Where there would be too many patterns, regions and lifts of the less promising servers count for nothing: that makes
-a pattern at most cheaper than its choices, by `floor` at most.
+If there would be too many patterns, regions and lifts of the less promising servers are ignored: this only makes a
+pattern cheaper than its choices, by `floor` at most.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     Indices = NDArray[np.intp]
 
 ROWS_AT_ONCE = 256
-"""Blocks whose patterns are worked out together: their arrays should fit the processor's cache."""
+"""Blocks whose patterns are computed together: their arrays should fit the processor's cache."""
 
 
 class ServerGroups:
@@ -53,8 +53,8 @@ class ServerGroups:
         singles = min(most_lifted, left - most_regions - (not apart))
         self.none = none
         self.single: Indices = np.full((rows, interfaces, singles + any(choosing)), columns)
-        """By block and interface: the servers that are groups by themselves; the number after that for no copy stands
-        for none at all."""
+        """By block and interface: the servers that are groups by themselves; the number after that of no copy stands
+        for no server at all."""
         self.multi: Indices = np.zeros((rows, interfaces, columns), dtype=np.intp)
         """By block, interface and server: the number of the multi; -1 in a single."""
         self.floor: Floats = np.zeros(rows)
@@ -75,11 +75,11 @@ class ServerGroups:
                 self.floor[row] = _floor(block, [set(servers[:singles]) for servers in lifted[row]])
         self.multis = self._region.shape[1]
         self.count = self.single.shape[2] + self.multis
-        """For each interface: first the singles, then the multis."""
+        """Number of groups of each interface: first the singles, then the multis."""
 
     def priced(self, rows: Indices, priced: Floats) -> Floats:
-        """The least of each group, of what the paths of these blocks cost: by block, interface and group. `priced` has
-        a last column that is infinite."""
+        """Return each group's least path cost, by block, interface and group. `priced` has a last column that is
+        infinite."""
         multi = self.multi[rows]
         of_multis = [np.where(multi == number, priced[:, :, :-1], np.inf).min(axis=2) for number in range(self.multis)]
         of_singles = np.take_along_axis(priced, self.single[rows], 2)
@@ -87,7 +87,7 @@ class ServerGroups:
         return found
 
     def servers(self, rows: Indices, priced: Floats, chosen: Indices) -> Indices:
-        """The servers with these least costs in the groups chosen, by block and interface."""
+        """Return the servers with these least costs in the chosen groups, by block and interface."""
         singles = self.single.shape[2]
         in_multi = self.multi[rows] == (chosen - singles)[:, :, None]
         cheapest: Indices = np.where(in_multi, priced[:, :, :-1], np.inf).argmin(axis=2)
@@ -98,7 +98,7 @@ class ServerGroups:
         return found
 
     def region_of(self, costs: StackedCosts) -> Indices:
-        """By block, interface and group: its region's number, or -1."""
+        """Return the number of each group's region, or -1, by block, interface and group."""
         rows, interfaces, _ = self.single.shape
         of_server = np.append(costs.region, np.full((rows, 1), -1), axis=1)
         of_single = of_server[np.arange(rows)[:, None, None], self.single]
@@ -108,7 +108,7 @@ class ServerGroups:
 
 
 def violations(blocks: Sequence[Block], costs: StackedCosts, groups: ServerGroups) -> NDArray[np.int16]:
-    """By block and pattern: how many copies share a domain; -1 where the block may not have that many copies."""
+    """Return how many copies share a domain, by block and pattern; -1 if the block may not have that many copies."""
     rows, interfaces, _ = groups.single.shape
     patterns = combinations(interfaces, groups.count)
     found = np.zeros((rows, len(patterns)), dtype=np.int16)
@@ -131,7 +131,7 @@ def violations(blocks: Sequence[Block], costs: StackedCosts, groups: ServerGroup
 
 
 def _lifted(block: Block) -> list[list[int]]:
-    """By interface: servers whose paths have lifts, the most promising first."""
+    """Return by interface the servers whose paths have lifts, the most promising first."""
     found: list[set[int]] = [set() for _ in block.interfaces]
     for (i, j), (k, m) in block.lifts:
         found[i].add(j)
@@ -142,7 +142,7 @@ def _lifted(block: Block) -> list[list[int]]:
 
 
 def _regions(block: Block, region: Indices) -> list[int]:
-    """Numbers of the known regions, that of the most promising server first."""
+    """Return the numbers of the known regions, that of the most promising server first."""
     if (region < 0).all():
         return []
     best = np.nanmin(np.array(block.epsilon, dtype=np.float64), axis=0, initial=1.0)
@@ -151,7 +151,7 @@ def _regions(block: Block, region: Indices) -> list[int]:
 
 
 def _floor(block: Block, singles: list[set[int]]) -> float:
-    """What the lifts that are not between singles add at least to a choice's cost."""
+    """Return the least that lifts not between singles add to a choice's cost."""
     least: dict[tuple[int, int], float] = {}
     for ((i, j), (k, m)), lift in block.lifts.items():
         if j not in singles[i] or m not in singles[k]:
