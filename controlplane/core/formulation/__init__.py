@@ -1,4 +1,4 @@
-"""Builds the problem from who is there and what was measured.
+"""Builds the problem from who is present and what was measured.
 
 Imports `registry`, `policy`, `estimate` and `problem`.
 """

@@ -1,6 +1,6 @@
-"""Builds one block of the assignment problem from measurements, and its rules from what members say.
+"""Builds one block of the assignment problem from measurements, and its rules from what members declare.
 
-Robots and clouds say their interfaces' labels, regions, charges and wishes. `problem_builder` decides which blocks
+Robots and clouds declare their interfaces' labels, regions, charges and wishes. `problem_builder` decides which blocks
 there are and when each is built.
 """
 
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 
 def with_rules(block: Block, robot: Sidecar, use: ServiceUse, clouds: Iterable[Sidecar]) -> Block:
-    """The block with its labels and wishes; `clouds` are at least those of its servers."""
+    """Return the block with its labels and wishes; `clouds` include at least those of its servers."""
     said = {label.interface: label for label in robot.labels}
     labels = [said.get(interface) or InterfaceLabel(interface) for interface in block.interfaces]
     by_name = {cloud.name: cloud for cloud in clouds}
@@ -57,41 +57,41 @@ def _charge_of(cloud: Sidecar, service: ServiceName) -> float:
 
 
 KEPT_PAIRS = 8
-"""Pairs whose estimates are kept take as long as one that is estimated."""
+"""Pairs with kept estimates that take as long as estimating one."""
 
 
 @dataclass(frozen=True, slots=True)
 class BlockNotes:
-    """What the mapping of a block has to say beside its plan."""
+    """What the mapping of a block reports besides its plan."""
 
     servers: tuple[NodeName, ...] = ()
-    """All live servers of the service, also those no path is up to."""
+    """All live servers of the service, including those without a path that is up."""
     dark: tuple[InterfaceName, ...] = ()
     """Interfaces left out of the problem, as no path over them is up."""
     all_dark: bool = False
-    """No path at all is up, so every pair was let in."""
+    """Whether no path at all is up, so that every pair was let in."""
     barred: frozenset[tuple[InterfaceName, NodeName]] = frozenset()
-    """Pairs that the operator's path rules keep mappings from."""
+    """Pairs that the operator's path rules keep out of mappings."""
     surplus: tuple[InterfaceName, ...] = ()
-    """Interfaces left out of the problem, as there are more promising ones, and enough of them."""
+    """Interfaces left out of the problem, as there are enough more promising ones."""
     penalised: tuple[NodeName, ...] = ()
-    """Servers left out of the problem, as the robot can not use their answers, and there are others."""
+    """Servers left out of the problem, as the robot cannot use their answers and there are others."""
     unserved: str = ""
-    """Why there is nothing to assign; then the problem has no such block."""
+    """Why there is nothing to assign; the problem then has no such block."""
     sending: Sending = field(default=NO_SENDING, compare=False)
-    """Where not all copies are sent at once: for the prediction alone."""
+    """How copies are sent if not all at once; used for the prediction alone."""
 
 
 @dataclass(frozen=True, slots=True)
 class Picture:
-    """The problem as it stands, and notes on every use of every robot."""
+    """The present problem, and notes on every use of every robot."""
 
     problem: Problem
     notes: Mapping[BlockKey, BlockNotes] = field(default_factory=dict)
 
 
 def interfaces_of(sidecar: Sidecar) -> tuple[InterfaceName, ...]:
-    """Its interfaces, in the order of their first candidate."""
+    """Return its interfaces, in the order of their first candidate."""
     return tuple(dict.fromkeys(candidate.interface for candidate in sidecar.candidates or ()))
 
 
@@ -108,13 +108,13 @@ def draw_block(
     known: tuple[Block, BlockNotes] | None = None,
     before: Block | None = None,
 ) -> Generator[float, None, tuple[Block, BlockNotes]]:
-    """Draw one robot's use of a service on these clouds, of which there is one at least, over these interfaces.
+    """Draw one robot's use of a service on these clouds, at least one, over these interfaces.
 
-    Only paths that are up are candidates, unless none is, and none of the pairs that are `barred`, of which not all
-    may be. Paths to servers that the robot penalises are candidates only if all are such. What is in `known` is not
-    estimated anew. Of many interfaces the most promising are taken, and those that were so `before`.
+    Only paths that are up are candidates, or all if none is up. `barred` pairs never are; they must not be all pairs.
+    Paths to servers that the robot penalises are candidates only if there are no others. What is in `known` is not
+    estimated again. Of many interfaces the most promising are taken, with a preference for those taken `before`.
 
-    Yields now and then how many pairs it has estimated since, or as many as took that long.
+    Yield from time to time the number of pairs estimated since, or of pairs that would have taken that long.
     """
     servers = tuple(cloud.name for cloud in clouds)
     allowed = {(interface, server) for interface in interfaces for server in servers} - barred
@@ -177,7 +177,7 @@ def _timings(
     now: float,
     before: Mapping[tuple[InterfaceName, NodeName], PairTiming],
 ) -> dict[tuple[InterfaceName, NodeName], PairTiming]:
-    """Of each pair of one interface; what is known from `before` is not looked at again."""
+    """Return the timings of one interface's pairs; what is known from `before` is not computed again."""
     times = asked_times(use.deadline_s)
     timings: dict[tuple[InterfaceName, NodeName], PairTiming] = {}
     interface = block.interfaces[interface_number]
@@ -212,7 +212,7 @@ def _lifts(
     estimator: Estimator,
     now: float,
 ) -> dict[tuple[Path, Path], float]:
-    """How much more often than by chance two paths over different interfaces miss together, where it was measured."""
+    """Return how much more often than by chance two paths over different interfaces miss together, where measured."""
     lifts: dict[tuple[Path, Path], float] = {}
     row = {interface: number for number, interface in enumerate(interfaces)}
     column = {server: number for number, server in enumerate(servers)}

@@ -1,10 +1,10 @@
-"""The picture, of which only what may have changed is drawn anew.
+"""Keeps the picture up to date by redrawing only what may have changed.
 
-A use of a robot is drawn again at once when a path of it goes up or down, when who offers what to it changes, or when
-the robot misses far more deadlines than was believed. Other reports make it wait for the next routine solving, those
-first that were drawn longest ago, and no more of them at a time than `ROUTINE_PAIRS`: so the work for a large fleet is
-bounded. A block that came out as before,
-within what a change of the mapping could be worth, stays the very same object, which the matcher need not solve again.
+A robot's use is redrawn at once when one of its paths goes up or down, when the offers to it change, or when the robot
+misses far more deadlines than was believed. Other reports wait for the next routine solving. The uses drawn longest ago
+go first, and at most `ROUTINE_PAIRS` at a time: so the work for a large fleet is bounded. A block that came out as
+before, within what a change of the mapping could be worth, stays the very same object, which the matcher need not solve
+again.
 """
 
 from __future__ import annotations
@@ -33,41 +33,41 @@ SLICE_PAIRS = 40
 """Pairs (interface, server) estimated at a time: some milliseconds, for which streams wait."""
 
 ROBOT_PAIRS = 400
-"""Pairs of one robot estimated for one picture, but for the use that is begun: the others are for the next pictures. So
-whoever names many interfaces and services holds up no other robot. A robot with 8 interfaces that calls 4 services on
-16 servers has some 500."""
+"""Pairs of one robot estimated for one picture, apart from finishing the current use; the others wait for the next
+pictures. So a robot that names many interfaces and services delays no other robot. A robot with 8 interfaces that calls
+4 services on 16 servers has some 500."""
 
 USE_PAIRS = 1024
-"""Pairs of one use: of how many the estimator knows anything."""
+"""Pairs of one use: as many as the estimator keeps."""
 
 MAX_INTERFACES = 64
-"""Interfaces of one robot that are looked at, the first that it names; where there are many servers fewer, ..."""
+"""Interfaces of one robot that are considered, the first that it names; fewer if there are many servers, ..."""
 
 LEAST_INTERFACES = 16
 """... but not fewer than these."""
 
 LOOKED_AT_ONCE = 200
-"""Robots of which it is found out in one go who could serve them: some milliseconds."""
+"""Robots checked in one go for who could serve them: some milliseconds."""
 
 FEW_ROBOTS = 16
-"""Robots that are all estimated anew when they are to be drawn at once: of more, those only that have to be."""
+"""Up to this many robots to be drawn at once are all re-estimated; of more, only those that have to be."""
 
 URGENT_AT_ONCE, URGENT_SHARE = 250, 0.25
-"""Robots that are to be drawn whatever it costs and are drawn for one picture: so many, or this share of those that
-wait, if that is more. So their mappings leave while the next ones are drawn, and each picture, which takes time for the
-whole fleet, is worth it: with 64 at a time a fleet of 500 was mapped a quarter later than all at once."""
+"""Urgent robots drawn for one picture: this many, or this share of those waiting, if that is more. So their mappings
+leave while the next ones are drawn, and each picture, which takes time for the whole fleet, is worth it. With 64 at a
+time a fleet of 500 was mapped a quarter later than all at once."""
 
 ROUTINE_PAIRS = 4000
 """Pairs estimated between two routine solvings because of reports alone: a tenth of a processor."""
 
 SURPRISE_MISSES = 2.0
-"""Misses beyond those believed in since a robot was drawn that let it not wait for its turn."""
+"""Misses beyond those expected since a robot was drawn from which it does not wait for its turn."""
 
 STALE_S = 30.0
-"""A robot that does not report is drawn again this often, as old measurements fade."""
+"""Interval at which a robot that does not report is redrawn, as old measurements fade."""
 
 EPSILON_SHARE, EPSILON_LEAST = 0.05, 1e-5
-"""Closer to what it was, an epsilon counts as the same: half of what a change must win (`stability`)."""
+"""An epsilon closer to its old value counts as unchanged: half of what a change must win (`stability`)."""
 
 LIFT_SHARE = 0.1
 WEIGHT_SHARE = 0.25
@@ -76,10 +76,10 @@ WEIGHT_SHARE = 0.25
 
 @dataclass(frozen=True, slots=True)
 class _Inputs:
-    """What a block is drawn from beside the measurements; equal if that is the same."""
+    """What a block is drawn from besides measurements; equal if nothing of that changed."""
 
     interfaces: tuple[InterfaceName, ...]
-    """Those that are looked at."""
+    """Those that are considered."""
     labels: tuple[InterfaceLabel, ...]
     use: ServiceUse
     offers: tuple[tuple[Registration, ServiceOffer], ...]
@@ -90,14 +90,14 @@ class _Inputs:
 
     @property
     def pairs(self) -> int:
-        """Pairs to estimate; where second copies leave late, each takes half as long again."""
+        """Pairs to estimate; if second copies leave late, each takes half as long again."""
         pairs = len(self.interfaces) * len(self.clouds)
         return pairs + pairs // 2 if self.use.redundancy.sends_late else pairs
 
 
 @dataclass(slots=True)
 class _Drawn:
-    """A use of a robot as drawn last."""
+    """A use of a robot as last drawn."""
 
     inputs: _Inputs
     block: Block | None
@@ -112,22 +112,22 @@ class _Work:
     anew: bool
     urgent: bool
     uses: list[tuple[BlockKey, _Inputs]]
-    """Still to be drawn, the last one first."""
+    """Uses still to be drawn, the last one first."""
     steps: Generator[float, None, None] | None = None
-    """Of the use that is being drawn."""
+    """Steps of the use that is being drawn."""
     pairs: float = 0.0
-    """Estimated for this picture."""
+    """Pairs estimated for this picture."""
 
 
 @dataclass(frozen=True, slots=True)
 class _LookedAt:
-    """What a robot, as it was, could call where."""
+    """What a robot, as it was then, could call where."""
 
     robot: Sidecar
     uses: tuple[tuple[BlockKey, _Inputs], ...]
 
     def holds_for(self, robot: Sidecar) -> bool:
-        """Whether nothing of this has changed with the robot; who is equal but not the same is looked at again."""
+        """Return whether nothing relevant of the robot has changed; equal but not identical counts as changed."""
         was = self.robot
         return robot is was or (
             robot.services is was.services and robot.candidates is was.candidates and robot.labels is was.labels
@@ -136,7 +136,7 @@ class _LookedAt:
 
 @dataclass(frozen=True, slots=True)
 class _Frame:
-    """Who is there, and what each robot could call where."""
+    """Who is present, and what each robot could call where."""
 
     uses: Mapping[NodeName, tuple[tuple[BlockKey, _Inputs], ...]]
     fleet_capacity: Mapping[FleetKey, int]
@@ -157,66 +157,66 @@ class Drawing:
         self._around: list[object] = []
         """The policy, and what matters of the clouds, when ..."""
         self._looked_at: dict[NodeName, _LookedAt] = {}
-        """... these robots were looked at last."""
+        """... these robots were last examined."""
         self._drawn: dict[BlockKey, _Drawn] = {}
         self._at: dict[NodeName, float] = {}
-        """When each robot was drawn last."""
+        """When each robot was last drawn."""
         self._urgent: dict[NodeName, bool] = {}
-        """Robots to draw whatever it costs, and whether their pairs have to be estimated anew."""
+        """Robots to draw whatever it costs, and whether their pairs have to be re-estimated."""
         self._surprise: dict[NodeName, float] = {}
-        """Robots that reported since they were drawn, and their misses beyond those believed in."""
+        """Robots that reported since they were drawn, and their misses beyond those expected."""
         self._routine = False
         self._queue: list[NodeName] | None = None
-        """Robots still to be drawn for the next picture because of reports, the last one first; None until looked
-        for."""
+        """Robots still to be drawn for the next picture because of reports, the last one first; None until
+        determined."""
         self._urgent_order: list[NodeName] = []
-        """Of the urgent ones, the last one first; those that became so since are not in it."""
+        """The urgent robots, the last one first, without those that became urgent since."""
         self._urgent_most = 0
         self._urgent_drawn = 0
-        """For the next picture, of at most so many."""
+        """Urgent robots drawn for the next picture, of at most `_urgent_most`."""
         self._routine_pairs = 0
         self._work: _Work | None = None
         """The robot that is being drawn."""
         self._aside: dict[NodeName, _Work] = {}
         """Robots that have had their share of this picture."""
         self._rests: dict[NodeName, list[tuple[BlockKey, _Inputs]]] = {}
-        """Of robots that wait for another picture with some of their uses, what is left of them, ..."""
+        """Remaining uses of robots that wait for another picture with some of them, ..."""
         self._first: dict[NodeName, BlockKey] = {}
-        """... or, where a robot is to be drawn whole once more, with which use to begin: all of them get their turn."""
+        """... or, for a robot to be drawn whole once more, the use to begin with: all of them get their turn."""
 
     # ── what changed ──
 
     def members_changed(self) -> None:
-        """A sidecar, its addresses or services, or the policy changed."""
+        """Note that a sidecar, its addresses or services, or the policy changed."""
         self._frame = self._looking = None
 
     def robot_changed(self, robot: NodeName, *, anew: bool = True) -> None:
         """Draw this robot in the next picture whatever it costs.
 
-        Unless `anew`, pairs that it has already may keep their estimates: its paths changed, not what is known of them.
-        They do where many robots changed at once, as when a server dies: all are to have other mappings within a
-        second, and are estimated anew in their turn.
+        Unless `anew`, pairs that it already has may keep their estimates: its paths changed, not what is known of them.
+        They do when many robots changed at once, as when a server dies: all need other mappings within a second, and
+        are re-estimated in their turn.
         """
         self._urgent[robot] = anew or self._urgent.get(robot, False)
         self._draw_whole(robot)
 
     def is_urgent(self, robot: NodeName) -> bool:
-        """Whether it is to be drawn whatever it costs."""
+        """Return whether it is to be drawn whatever it costs."""
         return robot in self._urgent
 
     def cost(self, robot: NodeName) -> int:
-        """How many pairs it takes to draw a robot."""
+        """Return how many pairs it takes to draw a robot."""
         uses = self._frame.uses.get(robot, ()) if self._frame is not None else ()
         return sum(inputs.pairs for _, inputs in uses)
 
     def _draw_whole(self, robot: NodeName) -> None:
-        """What is left to be drawn of a robot is not all any more."""
+        """Note that more of a robot is to be drawn than what was left."""
         rest = self._rests.pop(robot, None)
         if rest:
             self._first[robot] = rest[-1][0]
 
     def reported(self, robot: NodeName, report: Report) -> bool:
-        """A robot's report was merged into the estimates; True if it misses far more deadlines than was believed."""
+        """Note that a robot's report was merged; return True if it misses far more deadlines than was believed."""
         surprise = self._surprise.get(robot, 0.0)
         for latency in report.latencies:
             if not latency.missed:
@@ -230,7 +230,7 @@ class Drawing:
     # ── drawing ──
 
     def begin(self, *, routine: bool) -> None:
-        """The next picture is wanted; unless `routine`, new reports alone do not matter for it."""
+        """Begin the next picture; unless `routine`, new reports alone do not matter for it."""
         self._routine = routine
         self._queue = None
         self._put_back()
@@ -243,12 +243,12 @@ class Drawing:
 
     @property
     def urgent_left(self) -> bool:
-        """Whether the next picture is wanted at once, for robots that this one has no place for."""
+        """Whether the next picture is wanted at once, for robots that this one has no room for."""
         return bool(self._urgent) or any(work.urgent for work in self._aside.values())
 
     @property
     def routine_left(self) -> bool:
-        """Whether some robots were left out that are to be drawn because of reports."""
+        """Whether some robots due because of reports were left out."""
         return bool(self._queue) or any(not work.urgent for work in self._aside.values())
 
     def advance(
@@ -259,10 +259,10 @@ class Drawing:
         now: float,
         lost: Callable[[NodeName], float] = lambda robot: 0.0,
     ) -> bool:
-        """Draw some of what has to be drawn for the next picture; True once that is complete.
+        """Draw some of what has to be drawn for the next picture; return True once that is complete.
 
-        `sidecars` are those ready. Urgent robots go first, those with most `lost` before others; beside them those
-        that merely reported get a slice. To be called again until it returns True, with other work in between.
+        `sidecars` are those ready. Urgent robots go first, those with most `lost` before others; beside them those that
+        merely reported get a slice. Call this again until it returns True, with other work in between.
         """
         if self._frame is None:
             if self._looking is None:
@@ -293,7 +293,7 @@ class Drawing:
         return not (self._work or self._urgent or self._queue)
 
     def _draw_some(self, work: _Work, estimator: Estimator, now: float) -> float:
-        """Returns the pairs that were estimated, or as many as that took time for."""
+        """Draw some of it; return the number of pairs estimated, or of pairs that would have taken that long."""
         if work.steps is None:
             if not work.uses:
                 return 0.0
@@ -305,7 +305,7 @@ class Drawing:
             return 0.0
 
     def _set_aside(self, work: _Work) -> None:
-        """A robot has had its share of this picture."""
+        """Set aside a robot that has had its share of this picture."""
         self._work = None
         self._aside[work.robot] = work
         if work.robot not in self._urgent:
@@ -333,7 +333,7 @@ class Drawing:
         return _Work(robot, anew, urgent, uses[::-1])
 
     def _next_robot(self, lost: Callable[[NodeName], float]) -> tuple[NodeName, bool, bool] | None:
-        """The robot to draw next, whether it is estimated anew, and whether it is urgent; None if the picture is
+        """Return the robot to draw next, whether to re-estimate it, and whether it is urgent; None if the picture is
         complete."""
         if not self._urgent_drawn:
             self._urgent_most = max(URGENT_AT_ONCE, round(URGENT_SHARE * len(self._urgent)))
@@ -349,7 +349,7 @@ class Drawing:
         return None
 
     def _next_urgent(self, lost: Callable[[NodeName], float]) -> NodeName | None:
-        """The urgent robot that is next, of those that have not had their share of this picture."""
+        """Return the next urgent robot of those that have not had their share of this picture."""
         for again in (False, True):
             if again:
                 waiting = [robot for robot in reversed(self._urgent) if robot not in self._aside]
@@ -361,13 +361,13 @@ class Drawing:
         return None
 
     def _put_back(self) -> None:
-        """A robot of which some uses were drawn is drawn anew, beginning with the one that was being drawn."""
+        """Redraw a partly drawn robot, beginning with the use that was being drawn."""
         if self._work is not None:
             work, self._work = self._work, None
             self.robot_changed(work.robot, anew=work.anew)
 
     def picture(self) -> Picture:
-        """What was drawn."""
+        """Return what was drawn."""
         frame = self._frame or _Frame({}, {})
         keys = [key for uses in frame.uses.values() for key, _ in uses if key in self._drawn]
         blocks = tuple(block for key in keys if (block := self._drawn[key].block) is not None)
@@ -375,10 +375,10 @@ class Drawing:
         return Picture(Problem(blocks, frame.fleet_capacity, self._objective), notes)
 
     def _look_around(self, sidecars: Iterable[Sidecar], permits: Permits) -> Iterator[None]:
-        """Find out who could call what where, in several goes; at last it is the frame.
+        """Find out in several goes who could call what where; the end result is the frame.
 
-        Of robots that are as before, while clouds and policy are, what was found out before holds. So who is
-        interrupted by the next change has got on.
+        For unchanged robots, while clouds and policy are unchanged, earlier results hold. So an interruption by the
+        next change does not lose the progress.
         """
         clouds: dict[tuple[ServiceName, str], list[Sidecar]] = {}
         fleet_capacity: dict[FleetKey, int] = {}
@@ -437,7 +437,7 @@ class Drawing:
                 del table[gone]
 
     def _next_routine(self, frame: _Frame, now: float) -> list[NodeName]:
-        """Robots to draw because of reports, those last that are drawn first."""
+        """Return robots to draw because of reports, those to be drawn first last."""
         routine = [name for name in frame.uses if name not in self._urgent and self._is_due(name, now)]
         routine.sort(key=lambda name: self._at.get(name, 0.0))
         pairs, taken = 0, 0
@@ -454,7 +454,7 @@ class Drawing:
     def _draw_use(
         self, key: BlockKey, inputs: _Inputs, estimator: Estimator, now: float, *, anew: bool
     ) -> Generator[float, None, None]:
-        """Yields as `draw_block`."""
+        """Draw a use; yields like `draw_block`."""
         before = self._drawn.get(key)
         if inputs.unserved:
             servers = tuple(cloud.name for cloud in inputs.clouds)
@@ -486,7 +486,7 @@ def _inputs(
     clouds: tuple[Sidecar, ...],
     path_rules: PathRules,
 ) -> _Inputs:
-    """Of those who offer the service the robot may call it on `clouds`."""
+    """Return the inputs of a use: of those `offering` the service, the robot may call it on `clouds`."""
     interfaces = interfaces_of(robot)[: max(LEAST_INTERFACES, min(MAX_INTERFACES, USE_PAIRS // max(1, len(clouds))))]
     barred = path_rules.barred(robot.name, interfaces, [cloud.name for cloud in clouds])
     if not offering:
@@ -510,7 +510,7 @@ def _epsilon(block: Block, interface: InterfaceName, server: NodeName) -> float:
 
 
 def is_alike(block: Block, before: Block) -> bool:
-    """Whether a block differs from what it was by no more than no change of the mapping could be worth."""
+    """Return whether a block differs from its old state by no more than no change of the mapping could be worth."""
     if replace(block, epsilon=before.epsilon, lifts=before.lifts, weights=before.weights) != before:
         return False
     if len(block.weights) != len(before.weights) or block.lifts.keys() != before.lifts.keys():

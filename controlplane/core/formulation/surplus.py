@@ -1,7 +1,7 @@
-"""Which of a robot's many interfaces the mapping of a service is sought among.
+"""Chooses which of a robot's many interfaces a service's mapping may use.
 
-A request goes out in a handful of copies, however many interfaces there are, and the number of choices grows with the
-power of them: of ten a single robot's would hold up the mappings of all others.
+A request goes out in a handful of copies, however many interfaces there are, and the number of choices grows
+exponentially with them: with ten, a single robot's would hold up the mappings of all others.
 """
 
 from __future__ import annotations
@@ -20,10 +20,10 @@ if TYPE_CHECKING:
     from protos.model.members import ServiceUse
 
 MAX_PLANNED = 8
-"""Interfaces of one robot in one mapping: as many copies of a request a robot sends at most."""
+"""Interfaces of one robot in one mapping: the maximum number of copies a robot sends of a request."""
 
 STAYS = 0.5
-"""What an interface that was among them misses counts so much: no two of them take turns by chance."""
+"""Factor on the miss probability of an interface taken before, so that no two take turns by chance."""
 
 
 def most_promising(
@@ -33,9 +33,9 @@ def most_promising(
     estimates: Mapping[tuple[InterfaceName, NodeName], Estimate],
     before: Block | None,
 ) -> tuple[InterfaceName, ...]:
-    """Up to `MAX_PLANNED` of these interfaces, in their order.
+    """Return up to `MAX_PLANNED` of these interfaces, in their order.
 
-    In turn the one that misses least, one of each carrier first, and, where the service is to be cheap, the cheapest.
+    Take in turn the one that misses least, one of each carrier first, and, for a service to be cheap, the cheapest.
     """
     if len(interfaces) <= MAX_PLANNED:
         return interfaces
