@@ -1,1 +1,1 @@
-"""The assignment problem: blocks, choices, costs, plans (paper, section on the matcher). Imports `estimate`."""
+"""Defines the assignment problem: blocks, choices, costs, plans (paper, section on the matcher). Imports `estimate`."""

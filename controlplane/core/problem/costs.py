@@ -1,6 +1,6 @@
-"""What a block's choice costs in all: the objective, the failure domains, and for a block with a target its charges.
+"""Computes the total cost of a block's choice: objective, failure domains, and for a block with a target its charges.
 
-As reliable as can be:
+As reliable as possible:
 
     RULE_PRICE x violations + what the objective says
 
@@ -9,10 +9,10 @@ With a target, p being the probability that all copies miss and n the number of 
     p <= target    RULE_PRICE x violations + charge / largest charge + TIE_PRICE x log p
     p > target     RULE_PRICE x (4 n + violations + copies left out) + log(p / target)
 
-So a choice that meets the target comes before all that do not, one that shares no domain before those that do, and
-then the cheaper one; of equally cheap ones the more reliable. Where none meets the target, a copy left out counts as
-much as one that shares a domain, and then the most reliable choice is taken. The largest charge is that of a copy over
-every interface to its dearest server: so what stands beside RULE_PRICE is comparable between robots.
+So a choice that meets the target comes before all that do not, one that shares no domain before those that do, and then
+the cheaper one; of equally cheap ones the more reliable. If none meets the target, a copy left out counts as much as
+one that shares a domain, and then the most reliable choice is taken. The largest charge is that of a copy over every
+interface to its dearest server: so the other terms beside RULE_PRICE are comparable between robots.
 """
 
 from __future__ import annotations
@@ -34,21 +34,22 @@ if TYPE_CHECKING:
     Floats = NDArray[np.float64]
 
 RULE_PRICE = 2000.0
-"""Of one violation: more than any two choices differ by in the objective, as no logarithm is below that of
+"""Price of one violation: more than any two choices differ by in the objective, as no logarithm is below that of
 LEAST_POSITIVE (-708)."""
 
 TIE_PRICE = 1e-6
-"""Of the logarithm of the miss probability where charges decide: these count as equal within 0.1 % of the largest."""
+"""Price of the logarithm of the miss probability if charges decide: these count as equal within 0.1 % of the
+largest."""
 
 TARGET_TOLERANCE = 1e-9
-"""By what share a miss probability may exceed the target and meet it: rounding."""
+"""Share by which a miss probability may exceed the target and still meet it: rounding."""
 
 TARGET_FLOOR = TIE_PRICE * math.log(LEAST_POSITIVE)
-"""No choice of a block with a target costs less."""
+"""Minimum cost of any choice of a block with a target."""
 
 
 def block_cost(objective: Objective, block: Block, choice: Choice) -> float:
-    """The block's share of what is minimised."""
+    """Return the block's share of what is minimised."""
     shared = violations(block, choice)
     if block.target is None:
         return RULE_PRICE * shared + objective_cost(objective, block, choice)
@@ -60,7 +61,7 @@ def block_cost(objective: Objective, block: Block, choice: Choice) -> float:
 
 
 def choice_costs(objective: Objective, block: Block, choices: NDArray[np.intp]) -> Floats:
-    """`block_cost` of many choices, a row each, with -1 where an interface carries no copy; infinite over no path."""
+    """Return `block_cost` of many choices, one per row, -1 where an interface has no copy; infinite over no path."""
     shared = RULE_PRICE * violation_counts(block, choices)
     if block.target is None:
         return shared + objective_costs(objective, block, choices)
@@ -78,20 +79,20 @@ def choice_costs(objective: Objective, block: Block, choices: NDArray[np.intp]) 
 
 
 def meets(target: Target, log_miss: float) -> bool:
-    """Whether a miss probability, given as its logarithm, is within the target."""
+    """Return whether a miss probability, given as its logarithm, is within the target."""
     return log_miss <= math.log(target.miss) + TARGET_TOLERANCE
 
 
 def charge(target: Target, choice: Choice) -> float:
-    """What a request costs with all its copies."""
+    """Return what a request costs with all its copies."""
     return sum(row[server] for row, server in zip(target.charges, choice, strict=True) if server is not None)
 
 
 def largest_charge(block: Block) -> float:
-    """The charge of a copy over every interface to its dearest server; 1 where nothing costs anything."""
+    """Return the charge of a copy over every interface to its dearest server; 1 if nothing costs anything."""
     return (sum(max(row) for row in block.target.charges) if block.target is not None else 0.0) or 1.0
 
 
 def without_rules(costs: Floats) -> Floats:
-    """Costs less what RULE_PRICE contributes: what the objective, or the charges, say."""
+    """Return the costs less what RULE_PRICE contributes: what the objective, or the charges, say."""
     return costs - RULE_PRICE * np.rint(costs / RULE_PRICE)

@@ -1,9 +1,9 @@
-"""Failure domains: copies of a request should not share a region or a carrier.
+"""Counts violations of failure domains: copies of a request should not share a region or a carrier.
 
-A choice is charged with each copy that comes into a region, or behind a carrier, where there is one already. What has
-no label shares nothing. A copy that shares its server beyond the block's capacity counts as that alone, not as sharing
-the region too. Where every interface carries a copy, the carriers do not depend on the choice and are not counted; a
-service that is not idempotent has one server, and so one region.
+A choice is charged for each copy that enters a region, or a carrier's network, where there already is one. Interfaces
+and servers without a label share nothing. A copy that shares its server beyond the block's capacity counts as that
+alone, not also as sharing the region. If every interface carries a copy, the carriers do not depend on the choice and
+are not counted; a service that is not idempotent has one server, and so one region.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 
 def shared_domains(block: Block, choice: Choice) -> tuple[str, ...]:
-    """The regions and carriers that copies share, by name, whether or not the choice could help it."""
+    """Return the names of the regions and carriers that copies share, whether or not the choice could help it."""
     regions = _labels(block.regions, choice) if block.idempotent else []
     carriers = _labels(block.carriers, [None if server is None else i for i, server in enumerate(choice)])
     return tuple(
@@ -38,7 +38,7 @@ def shared_domains(block: Block, choice: Choice) -> tuple[str, ...]:
 
 
 def violations(block: Block, choice: Choice) -> int:
-    """How many copies share a domain with another before them; with a target, also those that share a server beyond
+    """Return how many copies share a domain with an earlier one; with a target, also those that share a server beyond
     the block's own capacity."""
     crowd = crowding(block, choice)
     count = crowd if block.target is not None else 0
@@ -51,7 +51,7 @@ def violations(block: Block, choice: Choice) -> int:
 
 
 def violation_counts(block: Block, choices: Indices) -> Indices:
-    """`violations` of many choices, a row each, with -1 where an interface carries no copy."""
+    """Return `violations` of many choices, one per row, with -1 where an interface carries no copy."""
     count = np.zeros(len(choices), dtype=np.intp)
     crowd = np.zeros(choices.shape, dtype=np.bool_)
     if block.idempotent and block.capacity:
@@ -65,14 +65,14 @@ def violation_counts(block: Block, choices: Indices) -> Indices:
 
 
 def repeats(labels: Indices, free: Indices) -> Indices:
-    """How many labels of each row have stood there `free` times before; interfaces are the last dimension, and what is
-    below 0 is no label."""
+    """Return how many labels of each row have occurred `free` times before; interfaces are the last dimension, and
+    values below 0 are no labels."""
     count: Indices = beyond(labels, free).sum(axis=-1)
     return count
 
 
 def beyond(labels: Indices, free: Indices) -> NDArray[np.bool_]:
-    """Which labels of each row have stood there `free` times before."""
+    """Return which labels of each row have occurred `free` times before."""
     found = np.zeros(labels.shape, dtype=np.bool_)
     for interface in range(1, labels.shape[-1]):
         label = labels[..., interface]
@@ -82,12 +82,12 @@ def beyond(labels: Indices, free: Indices) -> NDArray[np.bool_]:
 
 
 def chooses_interfaces(block: Block) -> bool:
-    """Whether some interface may go without a copy that could carry one."""
+    """Return whether some interface that could carry a copy may go without one."""
     return block.copies_wanted.least < len(block.interfaces)
 
 
 def least_violations(block: Block) -> int:
-    """How many violations no choice is below that does not crowd a server: as many as copies outnumber domains."""
+    """Return the minimum violations of a choice that crowds no server: as many as copies outnumber domains."""
     if block.target is not None:
         return 0
     least = block.copies_wanted.least
@@ -100,13 +100,13 @@ def least_violations(block: Block) -> int:
 
 
 def has_shared_regions(block: Block) -> bool:
-    """Whether two of its copies may meet in a region that is known."""
+    """Return whether two of its copies may meet in a known region."""
     labels = [region for region in block.regions if region]
     return block.idempotent and (_repeats(labels) > 0 or (bool(labels) and block.capacity != 1))
 
 
 def _within(block: Block, choice: Choice) -> list[int | None]:
-    """The choice without the copies beyond the block's own capacity."""
+    """Return the choice without the copies beyond the block's own capacity."""
     kept: list[int | None] = []
     for server in choice:
         kept.append(None if kept.count(server) >= block.capacity else server)
@@ -122,6 +122,6 @@ def _repeats(labels: Sequence[str]) -> int:
 
 
 def numbered(labels: Sequence[str]) -> Indices:
-    """Labels as numbers, equal ones as the same; -1 where there is none."""
+    """Return labels as numbers, equal ones as the same; -1 for no label."""
     number = {label: position for position, label in enumerate(dict.fromkeys(labels))}
     return np.array([number[label] if label else -1 for label in labels], dtype=np.intp)

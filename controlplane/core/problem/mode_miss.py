@@ -1,15 +1,15 @@
-"""How likely a request misses its deadline in the way its service sends copies (docs/use/redundancy.md).
+"""Estimates how likely a request misses its deadline in the way its service sends copies (docs/use/redundancy.md).
 
-The mapping is chosen as if every pair in it carried a copy at once. That is what `replicate` does; with the other modes
-more is missed, and this says how much, for what the operator is told. With first pair f and second pair s:
+The mapping is chosen as if every pair in it carried a copy at once. That is what `replicate` does; the other modes miss
+more. This module says how much, for what the operator is told. With first pair f and second pair s:
 
     single     epsilon_f
     others     epsilon_f q, where q is the probability that what follows a first copy that misses comes too late as well
 
 Before anything is known, q is 1 for `backup`, and where a budget may keep the second copy back. For `hedge` and
 `adaptive` it is L_s lift_fs, at least `TOGETHER`; L_s is the probability that a copy over s, sent later by the delay,
-misses what is left of the deadline. What became of earlier requests moves it (`late_fate`). Which pair a request goes
-over first only the robot knows: each counts by the requests that it carried lately.
+misses what is left of the deadline. The outcomes of earlier requests move it (`late_fate`). Only the robot knows which
+pair a request goes over first: each counts by the requests that it carried recently.
 """
 
 from __future__ import annotations
@@ -35,58 +35,58 @@ if TYPE_CHECKING:
     Pair = tuple[InterfaceName, NodeName]
 
 DELAYS = (1 / 16, 1 / 8, 1 / 4, 1 / 2)
-"""Parts of the deadline after which a second copy is taken to leave: the next of these, so that it is not promised too
-early. None leaves later than at the last."""
+"""Parts of the deadline after which a second copy is assumed to leave: the next of these, so that it is not promised
+too early. None leaves later than at the last."""
 
 LEAST_CARRIED = 1.0
-"""With fewer requests it is not known which pair goes first, and the worst one stands for it."""
+"""With fewer requests it is unknown which pair goes first, and the worst one stands for it."""
 
 UNTRIED_REQUESTS, UNTRIED_MISSES = 10.0, 0.5
-"""What the robot believes of a pair before it knows it: a pair that was hardly used ranks behind a good one."""
+"""The robot's prior belief about a pair: a hardly used pair ranks behind a good one."""
 
 
 @dataclass(frozen=True, slots=True)
 class PairTiming:
-    """What is known of a pair beside its epsilon, where copies are not all sent at once."""
+    """What is known of a pair besides its epsilon, if not all copies are sent at once."""
 
     carried: float
-    """Requests of the service that it carried lately."""
+    """Requests of the service that it carried recently."""
     delay: int = len(DELAYS) - 1
-    """After which of DELAYS a hedge leaves if this pair goes first."""
+    """Index in DELAYS of the time after which a hedge leaves if this pair goes first."""
     late: tuple[float, ...] = ()
-    """For each of DELAYS: how likely a copy over it misses that leaves so much later; empty if that is not known."""
+    """For each of DELAYS: how likely a copy over it that leaves this much later misses; empty if unknown."""
 
 
 NO_TIMING = PairTiming(0.0)
 
 TOGETHER = 0.25
-"""The least share of the first copies that miss of which the second one is believed to miss as well ..."""
+"""Minimum share of the missing first copies for which the second one is believed to miss as well ..."""
 
 TOGETHER_MISSES = 1.0
-"""... and what that belief is worth in independent misses of first copies."""
+"""... and the worth of that belief in independent misses of first copies."""
 
 
 @dataclass(frozen=True, slots=True)
 class Sending:
-    """What is known of a service's copies where not all are sent at once."""
+    """What is known of a service's copies if not all are sent at once."""
 
     timings: Mapping[Pair, PairTiming]
     first_missed: float = 0.0
-    """First copies that missed lately ..."""
+    """First copies that missed recently ..."""
     all_missed: float = 0.0
-    """... and requests of which all copies did; in independent ones."""
+    """... and requests of which all copies missed; both as independent ones."""
 
 
 NO_SENDING = Sending({})
 
 
 def is_timed(use: ServiceUse) -> bool:
-    """Whether the service's prediction takes more than the epsilons."""
+    """Return whether the service's prediction takes more than the epsilons."""
     return use.redundancy is not RedundancyMode.REPLICATE or use.budgeted
 
 
 def asked_times(deadline_s: float) -> NDArray[np.float64]:
-    """The times for which `pair_timing` wants to know how likely an answer takes longer."""
+    """Return the times for which `pair_timing` wants to know how likely an answer takes longer."""
     delays = deadline_s * np.array(DELAYS)
     return np.concatenate(([deadline_s], delays, deadline_s - delays))
 
@@ -97,25 +97,25 @@ def pair_timing(
     slower: NDArray[np.float64] | None,
     quantile: float,
 ) -> PairTiming:
-    """From the pair's probabilities to take longer than each of `asked_times`."""
+    """Derive the timing from the pair's probabilities of taking longer than each of `asked_times`."""
     if slower is None:
         return PairTiming(carried)
     in_all, after, left = slower[0], slower[1 : 1 + len(DELAYS)], slower[1 + len(DELAYS) :]
     soon = np.flatnonzero(after <= 1.0 - quantile)
-    # The parts say how much a later start costs, the requests that ran how much is missed anyway.
+    # The parts tell how much a later start costs, the requests that ran how much is missed anyway.
     late = np.clip(epsilon + np.maximum(0.0, left - in_all), epsilon, 1.0)
     return PairTiming(carried, int(soon[0]) if soon.size else len(DELAYS) - 1, tuple(late.tolist()))
 
 
 def predicted_miss(use: ServiceUse, planned: BlockPlan, sending: Sending) -> float:
-    """What is told of a mapping that was planned."""
+    """Return the miss probability to report for a planned mapping."""
     if planned.block is None:
         return planned.predicted_miss
     return miss_of(use, planned.block, planned.choice, sending)
 
 
 def miss_of(use: ServiceUse, block: Block, choice: Choice, sending: Sending) -> float:
-    """Probability that a request misses its deadline with this choice and the service's way to send copies."""
+    """Return the probability that a request misses with this choice and the service's way to send copies."""
     at_once = joint_miss(block, choice)
     paths = [(i, j) for i, j in enumerate(choice) if j is not None]
     if not is_timed(use) or len(paths) < 2:
@@ -130,7 +130,7 @@ def miss_of(use: ServiceUse, block: Block, choice: Choice, sending: Sending) -> 
 
 
 def _from(first: Path, of: Mapping[Path, PairTiming], use: ServiceUse, block: Block, sending: Sending) -> float:
-    """The same for requests that go over this pair first."""
+    """Return the same for requests that go over this pair first."""
     alone = _epsilon(block, first)
     if not use.redundancy.helps:
         return alone
@@ -140,7 +140,7 @@ def _from(first: Path, of: Mapping[Path, PairTiming], use: ServiceUse, block: Bl
 
 
 def _second_misses(first: Path, of: Mapping[Path, PairTiming], use: ServiceUse, block: Block) -> float:
-    """How likely no other copy is in time where the first one is not, before outcomes tell."""
+    """Return how likely no other copy is in time when the first one is not, before outcomes tell."""
     if not use.redundancy.sends_late or use.budgeted:
         return 1.0
     second = min((path for path in of if path != first), key=lambda path: _rank(of[path], _epsilon(block, path)))

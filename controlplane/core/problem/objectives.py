@@ -1,4 +1,4 @@
-"""What a block's choice costs under each objective; what else counts stands in `costs`.
+"""Computes what a block's choice costs under each objective; what else counts is in `costs`.
 
 With S the chosen pairs (i, j) of a block:
 
@@ -6,8 +6,8 @@ With S the chosen pairs (i, j) of a block:
 - `product`: the sum of log epsilon_ij.
 - `joint`: the logarithm of `joint_miss`.
 
-Minimising the sum of logarithms over all blocks asks of every robot the same relative gain: to make one robot's miss
-probability ten times smaller is worth as much as to make another's ten times smaller.
+Minimising the sum of logarithms over all blocks asks the same relative gain of every robot: making one robot's miss
+probability ten times smaller is worth as much as making another's ten times smaller.
 """
 
 from __future__ import annotations
@@ -27,15 +27,15 @@ if TYPE_CHECKING:
     from controlplane.core.problem.problem import Block, Choice
 
 PROBABILITY_FLOOR = 1e-9
-"""Probabilities and lifts below this count as this, so that their logarithms are finite: no posterior mean over less
-than a billion requests is smaller."""
+"""Smaller probabilities and lifts count as this, so that their logarithms are finite: no posterior mean over less than
+a billion requests is smaller."""
 
 LEAST_POSITIVE = sys.float_info.min
-"""What a product of very many paths comes to at least, so that it has a logarithm."""
+"""Lower limit for a product of very many paths, so that it has a logarithm."""
 
 
 def objective_cost(objective: Objective, block: Block, choice: Choice) -> float:
-    """What a choice of a block is worth by itself."""
+    """Return what a choice of a block costs by itself."""
     if objective is Objective.JOINT:
         return math.log(joint_miss(block, choice))
     chosen = [row[server] for row, server in zip(block.epsilon, choice, strict=True) if server is not None]
@@ -46,10 +46,10 @@ def objective_cost(objective: Objective, block: Block, choice: Choice) -> float:
 
 
 def joint_miss(block: Block, choice: Choice) -> float:
-    """Probability that all chosen paths miss; 1 without any.
+    """Return the probability that all chosen paths miss; 1 without any.
 
-    The product of their epsilons and of the lifts of all their pairs: exact for two paths. Beyond two it is a guess,
-    so it never exceeds what one pair or one path of the set allows.
+    It is the product of their epsilons and of the lifts of all their pairs: exact for two paths. For more it is a
+    guess, so it never exceeds what one pair or one path of the set allows.
     """
     paths = [(i, j) for i, j in enumerate(choice) if j is not None]
     epsilon = {(i, j): max(block.epsilon[i][j] or 0.0, PROBABILITY_FLOOR) for i, j in paths}
@@ -65,29 +65,29 @@ def joint_miss(block: Block, choice: Choice) -> float:
 
 
 def log_lift(lift: float) -> float:
-    """Its logarithm, finite."""
+    """Return the logarithm of a lift, finite."""
     return math.log(max(lift, PROBABILITY_FLOOR))
 
 
 def epsilon_matrix(block: Block) -> NDArray[np.float64]:
-    """By interface, then server; NaN where there is no path."""
+    """Return the epsilons by interface, then server; NaN where there is no path."""
     return np.array(block.epsilon, dtype=np.float64)
 
 
 def path_costs(objective: Objective, epsilon: NDArray[np.float64]) -> NDArray[np.float64]:
-    """What each path adds to the cost as long as lifts are 1; infinite where there is no path."""
+    """Return what each path adds to the cost while lifts are 1; infinite where there is no path."""
     costs = epsilon if objective is Objective.SUM else np.log(np.maximum(epsilon, PROBABILITY_FLOOR))
     return np.where(np.isnan(epsilon), np.inf, costs)
 
 
 def cost_of_none(objective: Objective) -> float:
-    """What an interface without a copy adds to the cost."""
+    """Return what an interface without a copy adds to the cost."""
     return 1.0 if objective is Objective.SUM else 0.0
 
 
 def objective_costs(objective: Objective, block: Block, choices: NDArray[np.intp]) -> NDArray[np.float64]:
-    """`objective_cost` of many choices, a row each, with -1 where an interface carries no copy; infinite where a path
-    does not exist."""
+    """Return `objective_cost` of many choices, one per row, with -1 where an interface carries no copy; infinite if a
+    path does not exist."""
     epsilon = epsilon_matrix(block)
     if objective is Objective.JOINT:
         return _joint_costs(block, epsilon, choices)
@@ -123,9 +123,9 @@ def _joint_costs(block: Block, epsilon: NDArray[np.float64], choices: NDArray[np
 
 
 def _lifts_of_pairs(block: Block, servers: int) -> dict[tuple[int, int], tuple[NDArray[np.intp], NDArray[np.float64]]]:
-    """By pair of interfaces: codes of the two servers, ascending, and the logarithms of their lifts.
+    """Return by pair of interfaces the codes of the two servers, ascending, and the logarithms of their lifts.
 
-    A table of all interfaces and servers would be as large as a robot likes that names hundreds of interfaces.
+    A table of all interfaces and servers could become arbitrarily large: a robot may name hundreds of interfaces.
     """
     lifts: dict[tuple[int, int], list[tuple[int, float]]] = {}
     for ((i, j), (k, m)), lift in block.lifts.items():

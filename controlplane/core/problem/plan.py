@@ -1,4 +1,4 @@
-"""What a plan for the assignment problem says, and what it costs."""
+"""Defines what a plan for the assignment problem says, and what it costs."""
 
 from __future__ import annotations
 
@@ -35,20 +35,20 @@ class BlockPlan:
     predicted_miss: float
     """Probability that all copies miss, see `objectives.joint_miss`."""
     excess: int = 0
-    """By how many interfaces the block's own capacity is exceeded."""
+    """Number of interfaces by which the block's own capacity is exceeded."""
     shared: tuple[str, ...] = ()
     """Regions and carriers that copies share."""
     target_miss: float = 0.0
-    """What was to be met at the least charge; 0: it was to be as reliable as can be."""
+    """Target to meet at the least charge; 0: as reliable as possible."""
     charge: float = 0.0
     """What a request costs with all its copies; 0 without a target."""
     shortfall: str = ""
     """By how much the target is missed, and what would meet it."""
     why: str = ""
-    """What made it change last; empty if it never did."""
+    """Reason of its last change; empty if it never changed."""
     block: Block | None = field(default=None, compare=False, repr=False)
     choice: Choice = field(default=(), compare=False, repr=False)
-    """What it was made from."""
+    """Block and choice that it was made from."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,17 +57,17 @@ class Plan:
 
     blocks: Mapping[BlockKey, BlockPlan]
     fleet_excess: Mapping[FleetKey, int] = field(default_factory=dict)
-    """By how many interfaces a server's limit over all robots is exceeded; only those that are."""
+    """Number of interfaces by which a server's limit over all robots is exceeded; only exceeded ones are listed."""
     bound: float = -math.inf
-    """No plan that exceeds capacities by no more costs less."""
+    """Lower bound on the cost of plans that exceed capacities by no more."""
     explore: Mapping[BlockKey, Assignment] = field(default_factory=dict)
-    """Pairs beside the planned ones of which a few requests would teach most."""
+    """Pairs other than the planned ones of which a few requests would teach most."""
     unproven: int = 0
-    """Groups of blocks whose gap stayed wider than wanted in the time given."""
+    """Groups of blocks whose gap stayed wider than wanted in the given time."""
 
     @property
     def cost(self) -> float:
-        """Of all blocks, as the objective has it."""
+        """Cost of all blocks under the objective."""
         return sum(block.cost for block in self.blocks.values())
 
     @property
@@ -78,32 +78,32 @@ class Plan:
 
     @property
     def relaxed(self) -> int:
-        """By how many interfaces capacities are exceeded in all."""
+        """Total number of interfaces by which capacities are exceeded."""
         return sum(block.excess for block in self.blocks.values()) + sum(self.fleet_excess.values())
 
 
 def relative_gap(cost: float, bound: float, size: float) -> float:
-    """How far a cost is above a bound, as a share of `size`, at most 1; rounding aside, it is never below."""
+    """Return how far a cost is above a bound, as a share of `size`, at most 1; it is never below, rounding aside."""
     if math.isinf(bound):
         return 1.0
     return min(1.0, max(0.0, cost - bound) / max(size, 1e-9))
 
 
 def size(costs: Sequence[float] | NDArray[np.float64]) -> float:
-    """What the costs of blocks come to without signs and rules, which would make a gap look smaller or larger."""
+    """Return the sum of the blocks' costs without signs and rules, which would make a gap look smaller or larger."""
     return float(np.abs(without_rules(np.asarray(costs, dtype=np.float64))).sum())
 
 
 @dataclass(frozen=True, order=True, slots=True)
 class Price:
-    """What a plan costs; ordered: first keep to the capacities, then cost little (`costs`)."""
+    """Cost of a plan, ordered: first keep to the capacities, then cost little (`costs`)."""
 
     excess: int
     cost: float
 
 
 def price(problem: Problem, choices: Mapping[BlockKey, Choice]) -> Price:
-    """What choices cost, of which each must be valid."""
+    """Return the cost of choices, each of which must be valid."""
     excess = sum(block_excess(block, choices[block.key]) for block in problem.blocks)
     excess += sum(fleet_excess(problem, choices).values())
     return Price(excess, sum(block_cost(problem.objective, block, choices[block.key]) for block in problem.blocks))
@@ -117,7 +117,7 @@ def make_plan(
     unproven: int = 0,
     before: Mapping[BlockKey, BlockPlan] | None = None,
 ) -> Plan:
-    """Write choices down as a plan; those that are as `before`, for the same blocks, are the same objects."""
+    """Write choices down as a plan; for the same block and choice as `before`, reuse the object."""
     plans: dict[BlockKey, BlockPlan] = {}
     for block in problem.blocks:
         choice = choices[block.key]
@@ -143,7 +143,7 @@ def make_plan(
 
 
 def choice_of(block: Block, plan: BlockPlan | None) -> Choice | None:
-    """The plan's choice in the block's present numbering; None if it is not valid there any more."""
+    """Return the plan's choice in the block's present numbering; None if it is no longer valid there."""
     if plan is None:
         return None
     if plan.block is block:

@@ -1,9 +1,8 @@
-"""The assignment problem of the paper (section on the matcher).
+"""Defines the assignment problem of the paper (section on the matcher).
 
 A block is one robot's use of one service: its interfaces i, the servers j, and epsilon_ij, the probability that a
-request sent over i to j misses the deadline. Binary x_ij; every interface gets exactly one server; at most
-`capacity` interfaces of the block share a server (the paper's is 1). What is minimised stands in `objectives` and
-`costs`.
+request sent over i to j misses the deadline. Binary x_ij; every interface gets exactly one server; at most `capacity`
+interfaces of the block share a server (the paper's is 1). `objectives` and `costs` define what is minimised.
 
 Beyond the paper:
 
@@ -12,7 +11,7 @@ Beyond the paper:
 - A block may have a target instead of the objective: the least charge that keeps its miss probability below it.
 - A server may limit how many interfaces of all robots it serves (`Problem.fleet_capacity`).
 - A service that is not idempotent goes to one server over all interfaces; capacity within the block does not apply.
-- Where no assignment keeps to the capacities, they are exceeded by the least total number of interfaces, and the
+- If no assignment keeps to the capacities, they are exceeded by the least total number of interfaces, and the
   plan says by how many. So a plan exists for every problem.
 """
 
@@ -33,7 +32,7 @@ if TYPE_CHECKING:
 
 
 class BlockKey(NamedTuple):
-    """Whose requests for what."""
+    """Identifies one robot's use of one service."""
 
     robot: NodeName
     service: ServiceName
@@ -63,12 +62,12 @@ Path = tuple[int, int]
 
 @dataclass(frozen=True, slots=True)
 class Target:
-    """A service that wants to be cheap, as long as it misses few enough deadlines."""
+    """Target of a service that wants to be cheap while it misses few enough deadlines."""
 
     miss: float
-    """The largest probability that all copies miss."""
+    """Maximum probability that all copies miss."""
     charges: tuple[tuple[float, ...], ...]
-    """What a copy of a request costs, by interface, then server; any one currency, not negative."""
+    """What a copy of a request costs, by interface, then server; in any one currency, not negative."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -84,25 +83,25 @@ class Block:
     """Interfaces of this block that may share a server; 0 means no limit."""
     idempotent: bool = True
     lifts: Mapping[tuple[Path, Path], float] = field(default_factory=dict)
-    """P(both miss) / (epsilon_1 epsilon_2) of two paths, that of the lower interface first; 1 where not named."""
+    """P(both miss) / (epsilon_1 epsilon_2) of two paths, that of the lower interface first; 1 if not named."""
     weights: tuple[tuple[float, ...], ...] = ()
     """By interface, then server: how many independent requests that epsilon is worth; empty if all are exact."""
 
     copies: Copies = EVERY_INTERFACE
     regions: tuple[str, ...] = ()
-    """By server: where it stands; empty texts where that is not known, empty if it never is."""
+    """Region of each server; an empty text if unknown, an empty tuple if none is known."""
     carriers: tuple[str, ...] = ()
-    """By interface: whose network it uses; the same."""
+    """Carrier of each interface, likewise."""
     target: Target | None = None
-    """None: as reliable as can be."""
+    """None: as reliable as possible."""
 
     @property
     def copies_wanted(self) -> Copies:
-        """How many copies, for the number of interfaces there are."""
+        """Number of copies, for the present number of interfaces."""
         return self.copies.over(len(self.interfaces))
 
     def estimate(self, path: Path) -> Estimate | None:
-        """What is believed of a path's miss probability; None if there is no path, or its epsilon is exact."""
+        """Return what is believed of a path's miss probability; None if there is no path, or its epsilon is exact."""
         interface, server = path
         epsilon = self.epsilon[interface][server]
         if epsilon is None or not self.weights:
@@ -112,20 +111,20 @@ class Block:
 
 @dataclass(frozen=True, slots=True)
 class Problem:
-    """All blocks, and what limits them together."""
+    """All blocks, and their common limits."""
 
     blocks: tuple[Block, ...]
     fleet_capacity: Mapping[FleetKey, int] = field(default_factory=dict)
-    """Interfaces of all robots that a server may serve for a service; those not named have no limit."""
+    """Interfaces of all robots that a server may serve for a service; servers not named have no limit."""
     objective: Objective = Objective.JOINT
 
 
 Choice = tuple[int | None, ...]
-"""For each interface of a block the index of its server; None where it carries no copy."""
+"""For each interface of a block the index of its server; None if it carries no copy."""
 
 
 def loads(choice: Choice, servers: int) -> list[int]:
-    """How many interfaces each server gets."""
+    """Return how many interfaces each server gets."""
     count = [0] * servers
     for server in choice:
         if server is not None:
@@ -134,33 +133,33 @@ def loads(choice: Choice, servers: int) -> list[int]:
 
 
 def crowding(block: Block, choice: Choice) -> int:
-    """How many interfaces share a server beyond the block's own capacity."""
+    """Return how many interfaces share a server beyond the block's own capacity."""
     if not block.capacity or not block.idempotent:
         return 0
     return sum(max(0, load - block.capacity) for load in loads(choice, len(block.servers)))
 
 
 def limits_used(problem: Problem, block: Block, choice: Choice) -> list[FleetKey]:
-    """For each interface the limit over all robots that it falls under, where it does."""
+    """Return the limits over all robots that the choice's interfaces fall under, one for each that has one."""
     keys = [FleetKey(block.servers[server], block.key.service) for server in choice if server is not None]
     return [key for key in keys if key in problem.fleet_capacity]
 
 
 def block_excess(block: Block, choice: Choice) -> int:
-    """By how many interfaces the choice exceeds what no block should; 0 for one with a target, which has its own
-    ranking of what it prefers (`costs`)."""
+    """Return by how many interfaces the choice exceeds what no block should; 0 for a block with a target, which has its
+    own ranking (`costs`)."""
     return 0 if block.target is not None else crowding(block, choice)
 
 
 def fleet_excess(problem: Problem, choices: Mapping[BlockKey, Choice]) -> dict[FleetKey, int]:
-    """By how many interfaces the choices exceed each limit over all robots; only those exceeded."""
+    """Return by how many interfaces the choices exceed each limit over all robots; only exceeded ones are listed."""
     load = Counter(key for block in problem.blocks for key in limits_used(problem, block, choices[block.key]))
     return {key: load[key] - limit for key, limit in problem.fleet_capacity.items() if load[key] > limit}
 
 
 def is_valid(block: Block, choice: Choice) -> bool:
-    """Whether the choice uses only paths that exist, as many as the block wants, and, for a service that is not
-    idempotent, one server, over as many of the interfaces as want it and reach it."""
+    """Return whether the choice uses only existing paths, as many as the block wants, and, for a service that is not
+    idempotent, one server, over as many of the interfaces as are wanted and reach it."""
     if len(choice) != len(block.interfaces):
         return False
     for row, server in zip(block.epsilon, choice, strict=True):
@@ -176,5 +175,5 @@ def is_valid(block: Block, choice: Choice) -> bool:
 
 
 def reachable(row: Iterable[float | None]) -> list[int]:
-    """The servers to which an interface's row has a path."""
+    """Return the servers to which an interface's row has a path."""
     return [server for server, epsilon in enumerate(row) if epsilon is not None]

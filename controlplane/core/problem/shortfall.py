@@ -1,4 +1,4 @@
-"""By how much a block misses its target, and what would meet it."""
+"""Says by how much a block misses its target, and what would meet it."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _STEPS = (1, 2, 5, 10)
 
 
 def shortfall(block: Block, choice: Choice) -> str:
-    """What to tell of a choice that misses the block's target; empty if it does not, or there is none.
+    """Return what to report of a choice that misses the block's target; empty if it does not, or there is none.
 
     Figures are rounded up to 1, 2 or 5 times a power of ten: the text must not change with every report.
     """
@@ -31,8 +31,8 @@ def shortfall(block: Block, choice: Choice) -> str:
 
 
 def _another_server(block: Block, choice: Choice, target: float) -> str:
-    """If one more server, for one of the interfaces that carry a copy, would do. All copies of what is not idempotent
-    go to one server, so one more would take the place of that."""
+    """Return whether one more server, for one of the interfaces that carry a copy, would do, as text. All copies of a
+    service that is not idempotent go to one server, so one more would take its place."""
     if not block.idempotent:
         return ""
     found = []
@@ -49,7 +49,7 @@ def _another_server(block: Block, choice: Choice, target: float) -> str:
 
 
 def _more_carriers(block: Block, choice: Choice, factor: float) -> str:
-    """How many more, to make the miss probability so many times what it is."""
+    """Return how many more carriers would multiply the miss probability by `factor`, as text."""
     if block.idempotent:
         epsilon, i = min((_best_server(block, i)[0], i) for i in range(len(block.interfaces)))
     else:
@@ -65,7 +65,7 @@ def _more_carriers(block: Block, choice: Choice, factor: float) -> str:
 
 
 def _best_server(block: Block, interface: int) -> tuple[float, int]:
-    """Its epsilon and its index."""
+    """Return its epsilon and its index."""
     row = block.epsilon[interface]
     return min((max(epsilon, PROBABILITY_FLOOR), j) for j, epsilon in enumerate(row) if epsilon is not None)
 
