@@ -1,1 +1,1 @@
-"""What of a new plan is worth a change, and what is worth exploring. Imports `problem`."""
+"""Decides which parts of a new plan are worth a change, and what is worth exploring. Imports `problem`."""

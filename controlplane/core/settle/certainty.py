@@ -1,4 +1,4 @@
-"""How likely one choice of paths is to be better than another, given how well each path's epsilon is known."""
+"""Computes how likely one choice of paths is better than another, given how well each path's epsilon is known."""
 
 from __future__ import annotations
 
@@ -19,18 +19,18 @@ if TYPE_CHECKING:
     from controlplane.core.problem.problem import Block, Choice, Path
 
 DRAWS = 128
-"""Of every unknown epsilon: the probability that comes out is good to 0.05."""
+"""Draws of every unknown epsilon: the resulting probability is accurate to 0.05."""
 
 _SEED = 1
-"""The same draws each time, so that what did not change is not judged anew."""
+"""Seed of the draws, the same each time, so that what did not change is not judged differently."""
 
 
 def probability_better(objective: Objective, changes: Iterable[tuple[Block, Choice, Choice]]) -> float:
-    """The probability that all blocks together cost less with the first choice of each than with the second.
+    """Return the probability that all blocks together cost less with the first choice of each than with the second.
 
     The epsilons of the paths that only one of the two uses are drawn from their Beta distributions. Rare misses make
-    these so skewed that a number of standard deviations would mean little. Paths that both use, and lifts, stay at what
-    is expected.
+    these so skewed that a number of standard deviations would mean little. Paths that both use, and lifts, keep their
+    expected values.
     """
     rng = np.random.default_rng(_SEED)
     saved = np.zeros(DRAWS)
@@ -45,7 +45,7 @@ def probability_better(objective: Objective, changes: Iterable[tuple[Block, Choi
 
 
 def probability_met(block: Block, choice: Choice) -> float:
-    """The probability that a choice keeps the target of its block, with the epsilons of its paths drawn likewise."""
+    """Return the probability that a choice keeps its block's target, with the epsilons of its paths drawn likewise."""
     if block.target is None:
         return 1.0
     rng = np.random.default_rng(_SEED)
@@ -60,7 +60,7 @@ def _paths(choice: Choice) -> set[Path]:
 
 
 def _off_mean(objective: Objective, block: Block, path: Path, rng: np.random.Generator) -> NDArray[np.float64]:
-    """By how much more than expected a path costs, in each draw."""
+    """Return by how much more than expected a path costs, in each draw."""
     estimate = block.estimate(path)
     if estimate is None:
         return np.zeros(DRAWS)

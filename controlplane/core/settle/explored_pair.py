@@ -1,8 +1,8 @@
-"""Which pair of an interface and a server, beside the mapped ones, a few requests would teach most about.
+"""Finds the pair of an interface and a server, besides the mapped ones, of which a few requests would teach most.
 
-The knowledge gradient (Frazier, Powell and Dayanik 2008): by how much the better of two epsilons, the one mapped and
-the other one, is expected to get better by what some more trials of the other one would say. It is small for a pair
-that is known well, and for one that is so bad that a few trials would hardly change that.
+The knowledge gradient (Frazier, Powell and Dayanik 2008): by how much the better of two epsilons, the mapped one and
+the other one, is expected to improve through the results of some more trials of the other one. It is small for a pair
+that is known well, and for one so bad that a few trials would hardly change that.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ WORTH_KNOWING = 1e-4
 """An expected gain below this is not worth a request."""
 
 STAYS = 0.5
-"""The pair that is explored stays until another one promises twice as much: each new pair is a new mapping."""
+"""The explored pair stays until another one promises twice as much: each new pair is a new mapping."""
 
 
 class _Kept(NamedTuple):
@@ -39,13 +39,13 @@ class _Kept(NamedTuple):
 
 
 class Exploration:
-    """What each block explores, solution after solution."""
+    """What each block explores, from one solution to the next."""
 
     def __init__(self) -> None:
         self._kept: dict[BlockKey, _Kept] = {}
 
     def update(self, problem: Problem, plan: Plan) -> dict[BlockKey, Assignment]:
-        """The pairs to explore beside this plan, by block; those of blocks that did not change stay."""
+        """Return the pairs to explore besides this plan, by block; those of unchanged blocks stay."""
         self._kept = {block.key: self._look(block, plan.blocks[block.key]) for block in problem.blocks}
         return {key: kept.pair for key, kept in self._kept.items() if kept.pair is not None}
 
@@ -58,7 +58,7 @@ class Exploration:
 
 
 def most_instructive(block: Block, plan: BlockPlan, before: Assignment | None) -> Assignment | None:
-    """The pair to explore, None if it is not worth it; `before` is the one explored so far."""
+    """Return the pair to explore, None if none is worth it; `before` is the one explored so far."""
     choice = choice_of(block, plan) if block.idempotent and block.weights else None
     if choice is None:
         return None
@@ -83,8 +83,8 @@ def _gains(block: Block, choice: Choice) -> Iterator[tuple[Assignment, float]]:
 
 
 def knowledge_gradient(rival: float, mean: float, weight: float) -> float:
-    """Expected gain of `TRIALS` more trials of Beta(mean x weight, ...) beside a rival known exactly (normal
-    approximation)."""
+    """Return the expected gain of `TRIALS` more trials of Beta(mean x weight, ...) against an exactly known rival
+    (normal approximation)."""
     spread = math.sqrt(mean * (1.0 - mean) / (weight + 1.0) * TRIALS / (TRIALS + weight))
     if spread <= 0.0:
         return 0.0

@@ -1,8 +1,8 @@
-"""What of a new plan is worth a change of the running one.
+"""Decides which parts of a new plan are worth changing the running one.
 
-Blocks whose choice differs are judged together where one needs the room that another leaves, and else each on its
-own. A change that need not be has to win by enough, and more surely than by chance; no service of a robot has more
-than a few of them in a minute. Every change carries its reason.
+Blocks whose choice differs are judged together if one needs the room that another leaves, and otherwise each on its
+own. An unforced change has to win by enough, and more surely than by chance; no service of a robot has more than a few
+of them in a minute. Every change carries its reason.
 """
 
 from __future__ import annotations
@@ -28,29 +28,29 @@ if TYPE_CHECKING:
 
 IMPROVEMENT_SHARE = 0.1
 IMPROVEMENT_MIN = 0.002
-"""What a change must save of its blocks' sum of miss probabilities, as a share and in all: below, it is the noise of
-the reports, and a change itself costs the requests in flight a detour."""
+"""Minimum that a change saves of its blocks' sum of miss probabilities, as a share and absolute: less is noise of the
+reports, and a change itself costs the requests in flight a detour."""
 
 IMPROVEMENT_LOG = -math.log(1 - IMPROVEMENT_SHARE)
-"""The same share where logarithms are summed, for each block that changes."""
+"""The same share for sums of logarithms, for each block that changes."""
 
 IMPROVEMENT_MIN_ALL_MISS = 1e-4
-"""What it must save there of the expected number of requests that miss, one of each block: products are smaller."""
+"""Minimum it saves there of the expected number of missed requests, one of each block: products are smaller."""
 
 SURE_ENOUGH = 0.7
-"""How likely the new choice has to be the better one. On recorded networks 0.9 halves the changes that 0.5 makes, and
-misses a twentieth more deadlines, as a path that got bad is kept too long; 0.7 costs a hundredth."""
+"""Minimum probability that the new choice is better. On recorded networks 0.9 halves the changes that 0.5 makes, but
+misses a twentieth more deadlines, as a path that became bad is kept too long; 0.7 costs a hundredth."""
 
 MAX_CHANGES = 4
 CHANGE_WINDOW_S = 60.0
-"""So often in so long a robot's service moves to something better. What died, or has no room, is left at once."""
+"""Maximum moves of a robot's service to something better in this window. What died, or has no room, is left at once."""
 
 HOPELESS = 0.5
-"""A path expected to miss more often than this is as good as dead where another one over the same interface is clearly
-better, and so are all where every copy misses so often: no number of changes keeps a robot there."""
+"""A path expected to miss more often than this counts as dead if another one over the same interface is clearly better.
+So do all paths if every copy misses this often: no number of changes keeps a robot there."""
 
 CLEARLY = 0.8
-"""A path misses at most so many of another one's requests to be clearly better."""
+"""Maximum share of another path's misses at which a path is clearly better."""
 
 TROUBLE = 1e-3
 """No path is trusted to miss less often when a gain is weighed: one that has not missed for minutes may go dark now,
@@ -63,9 +63,9 @@ class _Difference(NamedTuple):
     block: Block
     new: Choice
     old: Choice | None
-    """None where it is not valid any more."""
+    """None if it is no longer valid."""
     load: Mapping[FleetKey, int]
-    """Interfaces that each limit over all robots gets more, or less, of the block with the new choice."""
+    """Change in the block's interfaces under each limit over all robots with the new choice."""
 
 
 class Stability:
@@ -75,10 +75,10 @@ class Stability:
         self._changed: dict[BlockKey, deque[float]] = {}
 
     def settle(self, problem: Problem, new: Plan, running: Plan, now: float) -> Plan:
-        """Take of the new plan, which answers this problem, what is worth it; keep the rest of the running one.
+        """Take the worthwhile parts of the new plan, which answers this problem; keep the rest of the running one.
 
-        A change is made if the running choice is not valid any more (a path or a server of it is gone, an interface
-        came), if it ends some excess over the capacities, or if it saves enough at today's epsilons, and surely.
+        A change is made if the running choice is no longer valid (a path or a server of it is gone, an interface came),
+        if it removes some excess over the capacities, or if it saves enough at today's epsilons, and surely.
         """
         old = {block.key: choice_of(block, running.blocks.get(block.key)) for block in problem.blocks}
         choices = {key: choice for key, choice in old.items() if choice is not None}
@@ -148,10 +148,10 @@ def _differences(problem: Problem, new: Plan, old: Mapping[BlockKey, Choice | No
 
 
 def _with_kept_lifts(block: Block, new: Choice, old: Choice | None) -> Block:
-    """Where two interfaces were found to fail together, they do so whichever servers they are mapped to.
+    """Keep the lift of two interfaces that were found to fail together, whichever servers they are mapped to.
 
-    Else a change would win by what nobody has measured: paths that have carried no common request are taken to be
-    independent. Copies to one server may have failed together for its sake; of these nothing is kept.
+    Otherwise a change would win by something nobody has measured: paths that have carried no common request are taken
+    to be independent. Copies to one server may have failed together because of it; nothing of these is kept.
     """
     if old is None or not block.lifts:
         return block
@@ -170,7 +170,7 @@ def _with_kept_lifts(block: Block, new: Choice, old: Choice | None) -> Block:
 
 
 def _said(block: BlockPlan, running: Plan, why: Mapping[BlockKey, str]) -> BlockPlan:
-    """With the reason of its last change."""
+    """Return the block with the reason of its last change."""
     before = running.blocks.get(block.key)
     if block is before:
         return block
@@ -180,7 +180,7 @@ def _said(block: BlockPlan, running: Plan, why: Mapping[BlockKey, str]) -> Block
 def _linked(
     problem: Problem, differences: Sequence[_Difference], load: Mapping[FleetKey, int]
 ) -> list[list[_Difference]]:
-    """Put those together that touch a limit which would be exceeded if all came that want and none went."""
+    """Group those that touch a limit which would be exceeded if all newcomers came and nobody left."""
     coming: Counter[FleetKey] = Counter()
     touching: dict[FleetKey, list[int]] = {}
     for number, difference in enumerate(differences):
@@ -205,7 +205,7 @@ def _linked(
 
 
 def _more_excess(problem: Problem, together: Sequence[_Difference], load: Mapping[FleetKey, int]) -> int:
-    """By how many more interfaces capacities are exceeded with these changes."""
+    """Return by how many more interfaces capacities are exceeded with these changes."""
     more = 0
     change: Counter[FleetKey] = Counter()
     for difference in together:
@@ -219,7 +219,7 @@ def _more_excess(problem: Problem, together: Sequence[_Difference], load: Mappin
 
 
 def _is_worth_it(objective: Objective, together: Sequence[_Difference]) -> bool:
-    """Whether these changes save enough at today's estimates, and surely enough."""
+    """Return whether these changes save enough at today's estimates, and surely enough."""
     pairs = [(difference.block, difference.new, difference.old or ()) for difference in together]
     bound = [pair for pair in pairs if pair[0].target is not None]
     free = [pair for pair in pairs if pair[0].target is None]
@@ -233,9 +233,9 @@ def _keeps_target(block: Block, new: Choice, old: Choice) -> bool:
 
 
 def _suits_target(block: Block, new: Choice, old: Choice) -> bool:
-    """Whether the old choice likely misses the target and the new one is better, or the new one is cheaper.
+    """Return whether the old choice likely misses the target and the new one is better, or the new one is cheaper.
 
-    A target that one choice meets by a hair and the other misses so is no reason to go back and forth.
+    A target that one choice just meets and the other just misses is no reason to go back and forth.
     """
     if block.target is None or block_cost(Objective.JOINT, block, new) >= block_cost(Objective.JOINT, block, old):
         return False
