@@ -1,1 +1,2 @@
-"""What each sidecar is told, and whether it took it. Imports `registry`, `policy`, `problem` and `formulation`."""
+"""Tells each sidecar what to hold, and tracks whether it took it. Imports `registry`, `policy`, `problem`,
+`formulation`."""

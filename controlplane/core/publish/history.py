@@ -1,4 +1,4 @@
-"""The last changes of every mapping, for the operator. Times are monotonic seconds."""
+"""Remembers the last changes of every mapping, for the operator. Times are monotonic seconds."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ if TYPE_CHECKING:
     from protos.model.mapping import MappingSet, ServiceMapping
 
 MAX_CHANGES = 8
-"""Changes remembered of one robot's service: two minutes of the most that are made for the better."""
+"""Changes remembered of one robot's service: two minutes of the maximum rate of changes for the better."""
 
 MAX_HISTORIES = 8192
-"""Services of robots whose changes are remembered, the one changed longest ago goes: 4096 robots with two each."""
+"""Services of robots with remembered changes: 4096 robots with two each. The least recently changed one is evicted."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,12 +33,12 @@ class History:
     """What one robot was told of one service."""
 
     since: float
-    """When its requests went to other places last."""
+    """When its requests last changed their destinations."""
     changes: deque[SentMapping] = field(default_factory=lambda: deque(maxlen=MAX_CHANGES))
 
 
 class MappingHistory:
-    """The histories of all robots and services; also of robots that are away, for when they are back."""
+    """The histories of all robots and services, including robots that are away, for when they are back."""
 
     def __init__(self) -> None:
         self._histories: OrderedDict[BlockKey, History] = OrderedDict()
@@ -46,7 +46,7 @@ class MappingHistory:
         """Histories forgotten because there were too many."""
 
     def note(self, robot: NodeName, sent: MappingSet, now: float) -> None:
-        """A robot is sent this. What tells nothing new but another prediction is not remembered."""
+        """Remember what a robot is sent, unless only the prediction is new."""
         for mapping in sent.services:
             key = BlockKey(robot, mapping.service)
             history = self._histories.get(key)
@@ -65,5 +65,5 @@ class MappingHistory:
             history.changes.appendleft(SentMapping(now, sent.version, mapping))
 
     def of(self, key: BlockKey) -> History | None:
-        """What a robot was told of a service, the newest first; None if that is forgotten."""
+        """Return what a robot was told of a service, the newest first; None if that is forgotten."""
         return self._histories.get(key)

@@ -1,4 +1,4 @@
-"""The mapping each robot should hold, from who is there and the plan. Pure functions."""
+"""Computes the mapping each robot should hold, from who is present and the plan. Pure functions."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from protos.model.members import CallPermit
 
 PREDICTION_CHANGE = 2.0
-"""A new predicted miss probability alone is sent when it differs by this factor: it informs, nothing acts on it."""
+"""Factor by which a predicted miss probability alone must differ to be sent: it informs, nothing acts on it."""
 
 LEAST = {
     Objective.SUM: "least sum of miss probabilities",
@@ -41,9 +41,10 @@ def mapping_of(
     picture: Picture,
     previous: tuple[ServiceMapping, ...],
 ) -> tuple[ServiceMapping, ...]:
-    """The mapping of a robot, by service; names only its own interfaces and `servers`, for what it may call there.
+    """Return the mapping of a robot, by service, with only its own interfaces and `servers`, for what it may call
+    there.
 
-    A use that the picture does not know yet is left out until the next solving, which is due then.
+    A use not yet in the picture is left out until the next solving, which is due then.
     """
     interfaces = set(interfaces_of(robot))
     before = {mapping.service: mapping for mapping in previous}
@@ -74,7 +75,7 @@ def mapping_of(
 
 
 def changed_robots(plan: Plan, new_plan: Plan, picture: Picture, new_picture: Picture) -> set[NodeName]:
-    """The robots whose mappings another plan and picture may make different, as long as the members are the same."""
+    """Return the robots whose mappings may differ under another plan and picture, while the members are the same."""
     everything = plan.fleet_excess != new_plan.fleet_excess
     keys = new_picture.notes.keys() | picture.notes.keys()
     return {
@@ -130,7 +131,8 @@ def _standby(
 
 
 def _reason(block: BlockPlan, notes: BlockNotes, plan: Plan, objective: Objective, *, standby: bool) -> str:
-    """One short line; without figures that change with every report, as a new reason is a new version in time."""
+    """Return one short line, without figures that change with every report, as a new reason is a new version in
+    time."""
     parts = [block.shortfall or "least cost that meets the target" if block.target_miss else LEAST[objective]]
     if block.why:
         parts.append(block.why)
@@ -159,7 +161,7 @@ def _reason(block: BlockPlan, notes: BlockNotes, plan: Plan, objective: Objectiv
 
 
 def differs(new: tuple[ServiceMapping, ...], old: tuple[ServiceMapping, ...]) -> bool:
-    """Whether a robot would do something else, or has to know why it cannot do anything."""
+    """Return whether a robot would act differently, or has to know why it cannot act."""
     if len(new) != len(old):
         return True
     return any(
@@ -170,7 +172,7 @@ def differs(new: tuple[ServiceMapping, ...], old: tuple[ServiceMapping, ...]) ->
 
 
 def reads_differently(new: tuple[ServiceMapping, ...], old: tuple[ServiceMapping, ...]) -> bool:
-    """Whether what stands beside the same assignments is worth a new version, sooner or later."""
+    """Return whether the rest, beside equal assignments, is worth a new version sooner or later."""
     return any(
         a.reason != b.reason or _prediction_differs(a.predicted_miss, b.predicted_miss)
         for a, b in zip(new, old, strict=True)

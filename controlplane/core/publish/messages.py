@@ -1,4 +1,4 @@
-"""What leaves the core for one stream: messages, and its end."""
+"""Defines what leaves the core for one stream: messages, and its end."""
 
 from __future__ import annotations
 

@@ -1,21 +1,21 @@
 """Sends each sidecar its peers and its mapping when they change, and keeps what came of it.
 
-Warm-up. After a restart the registry is empty, while the robots go on with the peers they hold. A robot that says it
-holds a version is therefore sent nothing until every server that its own reports name is here again, or the warm-up
-is over: a set without a server that merely has not yet come back would cost the robot that server. Robots that hold
-nothing, and clouds (they find their robots by the robots' own probes), are served at once. Nor are sets judged by the
-policy before the warm-up is over (PeerSet.policy): a peer that is merely not back yet would be taken for one that the
-policy leaves nothing to do.
+Warm-up. After a restart the registry is empty, while the robots continue with the peers they hold. A robot that says it
+holds a version is therefore sent nothing until every server that its own reports name is back, or the warm-up is over:
+a set without a server that is merely not back yet would cost the robot that server. Robots that hold nothing, and
+clouds (they find their robots by the robots' own probes), are served at once. Nor are sets judged by the policy before
+the warm-up is over (PeerSet.policy): a peer that is merely not back yet would be taken for one that the policy leaves
+nothing to do.
 
 Changes. A sidecar that takes changes of its peers is sent those that are new or different since what it was sent
 before, on the same stream or, as it says when it registers, on an earlier one. At a gap, that is if it refuses, it is
 sent all of them.
 
-Who is looked at. A change of a robot is news to that robot and to the clouds, one of a cloud or of the policy to
-everybody: the others are not looked at.
+Who is examined. A robot's change is news to that robot and to the clouds; a change of a cloud or of the policy is news
+to everybody. The others are not examined.
 
 Refusals. A sidecar refuses what it cannot hold at the moment: its interface went and is back, its driver hung. That
-passes, and what it is to hold need not change for it. So what is refused is sent again until it is taken.
+passes, and what it is to hold need not change because of it. So refused content is sent again until it is taken.
 """
 
 from __future__ import annotations
@@ -46,20 +46,20 @@ if TYPE_CHECKING:
     from protos.model.stream import Ack, Nack
 
 MAX_GONE_SNAPSHOTS = MAX_SIDECARS
-"""Sidecars that are gone and whose last set is remembered, for the notices when they return; the oldest go."""
+"""Sidecars that left whose last set is remembered, for the notices when they return; the oldest are evicted."""
 
 RESEND_S = 5.0
-"""From one sending of what is refused to the next: a cause that passed is cured within seconds, and a set of a hundred
-peers (1 kB each) that is refused for good takes 20 kB/s of a cellular link."""
+"""Interval at which refused content is resent: a passing cause is cured within seconds, and a set of a hundred peers (1
+kB each) that is refused permanently takes 20 kB/s of a cellular link."""
 
 
 INFORM_S = 5.0
-"""Within this time after a mapping a robot is not sent one that merely reads differently: nothing acts on that, and
-what is predicted of a robot that has just come changes with each of its first reports."""
+"""Time after a mapping in which a robot is not sent one that merely reads differently: nothing acts on that, and the
+prediction of a robot that has just come changes with each of its first reports."""
 
 
 class Publisher:
-    """The snapshots of all sidecars, those registered and the last ones gone."""
+    """The snapshots of all sidecars, those registered and the last ones that left."""
 
     def __init__(self, registry: Registry, *, version_epoch: int, warm_until: float | None) -> None:
         self._registry = registry
@@ -70,15 +70,15 @@ class Publisher:
         self.warm_until = warm_until
         """When the warm-up ends; None once it is over."""
         self._held_back: dict[NodeName, frozenset[NodeName] | None] = {}
-        """Robots, and the servers that they wait for; None before their first report."""
+        """Robots held back, and the servers that they wait for; None before their first report."""
         self.resend_at: float | None = None
         """When to `send_refused_again`, to all in one go; None while nothing is refused."""
         self.inform_at: float | None = None
-        """When to `inform`; None while there is nobody to."""
+        """When to `inform`; None while there is nobody to inform."""
         self._uninformed: set[NodeName] = set()
         """Robots whose mapping reads differently by now."""
         self._due: set[NodeName] = set()
-        """To look at for news with the next `publish`."""
+        """Sidecars to examine for news with the next `publish`."""
         self._clouds_due = False
         self._all_due = False
 
@@ -86,7 +86,7 @@ class Publisher:
         return self._snapshots[name]
 
     def begin_stream(self, registration: Registration) -> None:
-        """A registered sidecar has a new stream."""
+        """Note that a registered sidecar has a new stream."""
         name = registration.name
         snapshots = self._snapshots.get(name) or self._gone.pop(name, None) or Snapshots()
         self._snapshots[name] = snapshots
@@ -98,7 +98,7 @@ class Publisher:
             self._held_back[name] = None
 
     def changed(self, name: NodeName, role: Role) -> None:
-        """What this sidecar is told, or what others are told of it, may have changed."""
+        """Note that what this sidecar is told, or what others are told of it, may have changed."""
         self._due.add(name)
         if role is Role.CLOUD:
             self._all_due = True
@@ -106,11 +106,11 @@ class Publisher:
             self._clouds_due = True
 
     def all_changed(self) -> None:
-        """What everybody is told may have changed."""
+        """Note that what everybody is told may have changed."""
         self._all_due = True
 
     def forget(self, name: NodeName, role: Role) -> None:
-        """A sidecar is not registered any more."""
+        """Note that a sidecar is no longer registered."""
         self.changed(name, role)
         self._held_back.pop(name, None)
         self._uninformed.discard(name)
@@ -121,11 +121,11 @@ class Publisher:
             self._gone.popitem(last=False)
 
     def waits(self, name: NodeName) -> bool:
-        """Whether a robot is held back."""
+        """Return whether a robot is held back."""
         return name in self._held_back
 
     def release(self) -> bool:
-        """Let go of those whose servers are all back; returns whether there are any."""
+        """Release the robots whose servers are all back; return whether there are any."""
         returned = [
             name for name, servers in self._held_back.items() if servers is not None and self._are_back(servers)
         ]
@@ -139,25 +139,25 @@ class Publisher:
         return all(other is not None and other.ready for other in known)
 
     def waits_for(self, name: NodeName, servers: Iterable[NodeName]) -> bool:
-        """A robot reports on these servers; True if it is held back."""
+        """Note that a robot reports on these servers; return True if it is held back."""
         if name not in self._held_back:
             return False
         self._held_back[name] = frozenset(servers)
         return True
 
     def end_warm_up(self) -> None:
-        """Whoever is not back now is gone."""
+        """End the warm-up: sidecars not back now are gone."""
         self.warm_until = None
         self._held_back.clear()
         self.all_changed()
 
     def acked(self, name: NodeName, ack: Ack) -> bool:
-        """A sidecar applied what it was sent; False if that is stale."""
+        """Note that a sidecar applied what it was sent; return False if that is stale."""
         snapshots = self._snapshots[name]
         return snapshots.peers_acked(ack) if ack.resource is ResourceKind.PEERS else snapshots.mapping.ack(ack)
 
     def nacked(self, name: NodeName, nack: Nack, now: float) -> bool:
-        """A sidecar refused what it was sent; False if that is stale."""
+        """Note that a sidecar refused what it was sent; return False if that is stale."""
         snapshots = self._snapshots[name]
         if not snapshots.track(nack.resource).nack(nack):
             return False
@@ -168,26 +168,26 @@ class Publisher:
         return True
 
     def is_due(self, name: NodeName) -> bool:
-        """Whether there may be news for this sidecar in particular."""
+        """Return whether there may be news for this sidecar in particular."""
         return name in self._due
 
     def send_refused_again(self) -> None:
-        """What is refused now goes out with the next `publish`; the next refusal sets the time anew."""
+        """Send refused content with the next `publish`; the next refusal sets the time again."""
         self.resend_at = None
         for name, snapshots in self._snapshots.items():
             if snapshots.send_refused_again():
                 self._due.add(name)
 
     def inform(self) -> None:
-        """Whose mapping merely reads differently is looked at with the next `publish`."""
+        """Examine robots whose mapping merely reads differently with the next `publish`."""
         self.inform_at = None
         self._due.update(self._uninformed)
         self._uninformed.clear()
 
     def publish(self, permits: Permits, plan: Plan, picture: Picture, now: float) -> Iterator[Send | None]:
-        """Everything that is news to somebody, and None before each sidecar: so often other work may come in between.
+        """Yield everything that is news to somebody, and None before each sidecar, for other work in between.
 
-        Clouds first: what a robot learns that it may call shall be refused nowhere.
+        Clouds come first: what a robot learns that it may call must be refused nowhere.
         """
         views = Views(self._registry, permits, self._known_peers)
         for name in self._take_due():
@@ -200,7 +200,7 @@ class Publisher:
                 yield from self._mapping(sidecar, sidecar.stream, views, plan, picture, now)
 
     def _take_due(self) -> list[NodeName]:
-        """Whom to look at now, clouds first."""
+        """Return whom to examine now, clouds first."""
         everybody, clouds = self._all_due, self._all_due or self._clouds_due
         due = self._due
         self._due, self._clouds_due, self._all_due = set(), False, False
@@ -215,13 +215,13 @@ class Publisher:
         return clouds_due + robots_due
 
     def plan_changed(self, robots: Iterable[NodeName]) -> None:
-        """The mappings of these robots may be news with the next `publish`."""
+        """Note that the mappings of these robots may be news with the next `publish`."""
         self._due.update(robots)
 
     def publish_plan(
         self, robots: Iterable[NodeName], permits: Permits, plan: Plan, picture: Picture, now: float
     ) -> Iterator[Send | None]:
-        """The mappings of these robots, where they are news; who is there did not change since `publish`."""
+        """Yield the mappings of these robots that are news; the members have not changed since `publish`."""
         views = Views(self._registry, permits, self._known_peers)
         for name in robots:
             yield None
@@ -255,7 +255,7 @@ class Publisher:
         sent = snapshots.mapping.sent
         mapping = mappings.mapping_of(robot, views.servers_of(robot.name), plan, picture, sent or ())
         if sent is None:
-            # Nothing to say yet is no reason to take away what the sidecar holds from before.
+            # Having nothing to say yet is no reason to take away what the sidecar holds from before.
             worth_sending = bool(mapping)
         else:
             worth_sending = snapshots.mapping.send_again or mappings.differs(mapping, sent)
@@ -269,7 +269,7 @@ class Publisher:
             yield Send(stream, snapshots.send_mapping(mapping, self._versions, now))
 
     def sync_states(self) -> Iterator[tuple[NodeName, ResourceKind, SyncState]]:
-        """How far every registered sidecar follows; clouds get no mapping."""
+        """Yield how far every registered sidecar follows; clouds get no mapping."""
         for sidecar in self._registry:
             snapshots = self._snapshots[sidecar.name]
             yield sidecar.name, ResourceKind.PEERS, snapshots.peers.state

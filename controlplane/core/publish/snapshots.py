@@ -1,4 +1,4 @@
-"""What each sidecar was sent, and whether it took it: versions, nonces, acks and nacks, as in xDS."""
+"""Tracks what each sidecar was sent, and whether it took it: versions, nonces, acks and nacks, as in xDS."""
 
 from __future__ import annotations
 
@@ -28,22 +28,22 @@ class PeerView:
 
     peers: tuple[Peer, ...]
     policy: int = POLICY_PENDING
-    """Of PeerSet."""
+    """The `policy` of PeerSet."""
 
 
 MAX_LIFTED = 1 << 53
 """No control plane of ours gives out such a version: seconds since 1970 with 2^20 versions each are half of that in the
-year 2100. Whoever says that he holds one has it from a broken or hostile one, and begins anew."""
+year 2100. A sidecar that says it holds one has it from a broken or hostile one, and begins again."""
 
 
 class VersionSource:
-    """Gives out versions that only grow, also over restarts, as `epoch` grows with wall-clock time."""
+    """Gives out versions that only grow, even over restarts, as `epoch` grows with wall-clock time."""
 
     def __init__(self, epoch: int) -> None:
         self._last = epoch
 
     def above(self, floor: Version) -> Version:
-        """A new version, larger than `floor` and all given out before.
+        """Return a new version, larger than `floor` and all given out before.
 
         A floor beyond the epoch (what a sidecar says it holds) lifts this sidecar's version alone, not everybody's.
         """
@@ -52,19 +52,19 @@ class VersionSource:
 
 
 class Track(Generic[C]):
-    """One resource of one sidecar: what was sent last, and what became of it."""
+    """One resource of one sidecar: what was last sent, and what became of it."""
 
     def __init__(self) -> None:
         self.sent: C | None = None
-        """What was sent last, or None if the sidecar has to be sent everything."""
+        """What was last sent, or None if the sidecar has to be sent everything."""
         self.nonce = 0
         self.state = SyncState.NOT_SENT
-        """REJECTED stays while what was refused is sent again, until the sidecar has taken something."""
+        """REJECTED stays while refused content is resent, until the sidecar has taken something."""
         self.version_sent = Version(0)
         self.version_acked = Version(0)
         self.error = ""
         self.send_again = False
-        """Whether it is to be sent although it is what `sent` says: that was refused, a while ago."""
+        """Whether to send it although it equals `sent`: that was refused a while ago."""
         self.refused_as_before = False
         """Whether the last refusal gave the same reason as the one before, with nothing taken in between."""
         self._refusal: str | None = None
@@ -72,8 +72,8 @@ class Track(Generic[C]):
         self._floor = Version(0)
 
     def begin_stream(self, held: Version) -> None:
-        """A new stream: the sidecar says which version it holds; what else was sent may not have arrived."""
-        # Only to sidecars older than this control plane versions of other streams mean anything.
+        """Begin a new stream: the sidecar says which version it holds; anything else sent may not have arrived."""
+        # Versions of other streams mean something only to sidecars older than this control plane.
         self._floor = max(self.version_sent, held if held < MAX_LIFTED else Version(0))
         refused, self._unanswered = self.refused, False
         if self.sent is not None and held == self.version_sent and not refused:
@@ -88,7 +88,7 @@ class Track(Generic[C]):
         self._refusal = None
 
     def send(self, content: C, versions: VersionSource) -> Version:
-        """`content` goes out; returns its version. The nonce is the new `nonce`."""
+        """Note that `content` goes out; return its version. The nonce is the new `nonce`."""
         self.sent = content
         self.version_sent = self._floor = versions.above(self._floor)
         self.nonce += 1
@@ -100,7 +100,8 @@ class Track(Generic[C]):
         return self.version_sent
 
     def ack(self, ack: Ack) -> bool:
-        """The sidecar applied it; False if that is stale: about something sent earlier, or already refused."""
+        """Note that the sidecar applied it; return False if that is stale: about something earlier, or already
+        refused."""
         if ack.nonce != self.nonce or ack.version != self.version_sent or not self._unanswered:
             return False
         self._unanswered = False
@@ -111,7 +112,7 @@ class Track(Generic[C]):
         return True
 
     def nack(self, nack: Nack) -> bool:
-        """The sidecar refused it; False if that is stale."""
+        """Note that the sidecar refused it; return False if that is stale."""
         if nack.nonce != self.nonce or not (self._unanswered or self.state is SyncState.SYNCED):
             return False
         self._unanswered = False
@@ -124,12 +125,12 @@ class Track(Generic[C]):
 
     @property
     def refused(self) -> bool:
-        """Whether the sidecar refused what it was sent last, and was not sent it again since."""
+        """Whether the sidecar refused what it was last sent, and has not been sent it again since."""
         return self.state is SyncState.REJECTED and not self._unanswered
 
     @property
     def status(self) -> ResourceStatus:
-        """For the operator."""
+        """Status for the operator."""
         return ResourceStatus(self.version_sent, self.version_acked, self.state, self.error)
 
 
@@ -142,17 +143,17 @@ class Snapshots:
         self.peers: Track[PeerView] = Track()
         self.mapping: Track[tuple[ServiceMapping, ...]] = Track()
         self.mapped_at = -math.inf
-        """When the mapping was sent last."""
+        """When the mapping was last sent."""
         self.known_names: set[NodeName] = set()
-        """Peers the sidecar may know: of the set it acknowledged last and of all sent since."""
+        """Peers the sidecar may know: of the set it last acknowledged and of all sent since."""
         self.sent_changes = False
-        """Whether the last peers sent were changes of those before."""
+        """Whether the last peers sent were changes to those before."""
         self.whole_again_at = -math.inf
-        """From when on the refusal of changes is answered at once with the whole set."""
+        """Time from which a refusal of changes is answered at once with the whole set."""
 
     @property
     def base(self) -> Version:
-        """What changes of the peers can be upon: what the sidecar holds or is about to; 0 if only all of them will do.
+        """What changes of the peers can build on: the version the sidecar holds or is about to; 0 if only all will do.
 
         Messages of a stream arrive in order. Had the sidecar refused what went before, it would refuse the changes.
         """
@@ -163,9 +164,9 @@ class Snapshots:
     def send_peers(
         self, view: PeerView, told: ToldPeers, removed: tuple[RemovedPeer, ...], base: Version, versions: VersionSource
     ) -> PeerSet:
-        """Send the sidecar its peers; `told` are those that it is told, all of the view's or what changed upon `base`.
+        """Send the sidecar its peers; `told` are those that it is told: all of the view's, or what changed upon `base`.
 
-        `removed` names those that it may know and the view does not have.
+        `removed` names those that it may know and that the view does not have.
         """
         version = self.peers.send(view, versions)
         self.sent_changes = base > 0
@@ -179,17 +180,17 @@ class Snapshots:
         return MappingSet(version, self.mapping.nonce, services)
 
     def track(self, resource: ResourceKind) -> Track[PeerView] | Track[tuple[ServiceMapping, ...]]:
-        """One of the two."""
+        """Return one of the two."""
         return self.peers if resource is ResourceKind.PEERS else self.mapping
 
     def send_refused_again(self) -> bool:
-        """What is refused is due once more; as it is wanted then, and as a new version. Returns whether anything is."""
+        """Mark what is refused as due once more, as wanted then, and as a new version. Return whether anything is."""
         for track in (self.peers, self.mapping):
             track.send_again = track.refused
         return self.peers.send_again or self.mapping.send_again
 
     def peers_acked(self, ack: Ack) -> bool:
-        """The sidecar applied its peers: it forgot all others."""
+        """Note that the sidecar applied its peers: it forgot all others."""
         if not self.peers.ack(ack):
             return False
         if self.peers.sent is not None:
@@ -197,9 +198,10 @@ class Snapshots:
         return True
 
     def wants_whole_now(self, now: float, again_s: float) -> bool:
-        """The peers were refused: whether that calls for the whole set at once, at most once in `again_s` seconds.
+        """Note that the peers were refused; return whether to send the whole set now, at most once in `again_s`
+        seconds.
 
-        Changes may be refused for want of what they are upon, and the whole set is then taken.
+        Changes may be refused for lack of their base, and the whole set is then taken.
         """
         if not self.sent_changes or now < self.whole_again_at:
             return False

@@ -1,6 +1,6 @@
-"""The peers of one sidecar with the tokens that they introduce themselves with to it, and to nobody else.
+"""Holds the peers of one sidecar with the tokens by which they introduce themselves to it, and to nobody else.
 
-What many are told alike is made once (`views.py`), with the peers' own tokens; nobody is ever told those. The derived
+What many are told alike is made once (`views.py`), with the peers' own tokens, which nobody is ever told. The derived
 ones are made when the set is read, that is written to its stream: sets of a large fleet hold some 100,000 pairs, and
 one that a newer one supersedes costs nothing.
 """
@@ -36,11 +36,11 @@ class ToldPeers(Sequence["Peer"]):
         return map(self._told, self._peers)
 
     def names(self) -> Iterator[NodeName]:
-        """Their names, without making any token."""
+        """Return their names, without making any token."""
         return (peer.name for peer in self._peers)
 
     def with_tokens(self) -> Iterator[tuple[Peer, bytes]]:
-        """Each peer as all are told it, but for its token, and the token that this sidecar is told."""
+        """Yield each peer as all are told it, except for its token, and the token that this sidecar is told."""
         for peer in self._peers:
             yield peer, pair_token(peer.token, self._name, self._role)
 

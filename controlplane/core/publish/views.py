@@ -1,5 +1,5 @@
-"""What each sidecar is told of the others: the other role, those ready, and of them what the policy lets it have to do
-with. Made for one publication, so that what many are told alike is made once.
+"""Computes what each sidecar is told of the others: those of the other role that are ready, as far as the policy lets
+it have to do with them. Views are made for one publication, so that what many are told alike is made once.
 
 - A robot is told of the clouds on which it may call something, with the offers it may call.
 - A cloud is told of the robots that may call something on it, each with what that is.
@@ -23,29 +23,29 @@ if TYPE_CHECKING:
 
 
 MAX_PERMITS_KEPT = 64
-"""Of one robot; clouds that the same rules are about have the same."""
+"""Permits kept per sidecar; clouds covered by the same rules have the same."""
 
 
 class KnownPeers:
-    """Sidecars as their peers are told of them, from one publication to the next: nearly all are as they were.
+    """Sidecars as announced to their peers, kept from one publication to the next: nearly all stay as they were.
 
-    So they are the same objects, and two views are compared by them without a look inside.
+    So they are the same objects, and two views are compared by identity, without a look inside.
     """
 
     def __init__(self) -> None:
         self._made: dict[NodeName, tuple[Sidecar, dict[CallPermit, Peer]]] = {}
         self._former: dict[NodeName, tuple[Sidecar, dict[CallPermit, Peer]]] = {}
-        """Those made under the permits before: most are as good under the present ones, the others go with the next."""
+        """Those made under the former permits: most hold under the present ones; the others go with the next ones."""
         self._permits: Permits | None = None
 
     def under(self, permits: Permits) -> None:
-        """These permits are in force."""
+        """Note that these permits are in force."""
         if permits is not self._permits:
             self._permits = permits
             self._former, self._made = self._made, {}
 
     def peer(self, sidecar: Sidecar, permit: CallPermit) -> Peer:
-        """A robot that has this permit, or a cloud to those who have it there."""
+        """Return a robot that has this permit, or a cloud as told to those who have it there."""
         made = self._made.get(sidecar.name)
         if made is None or made[0] is not sidecar:
             made = self._made[sidecar.name] = sidecar, {}
@@ -59,7 +59,7 @@ class KnownPeers:
         return peer
 
     def forget(self, name: NodeName) -> None:
-        """It is not registered any more."""
+        """Note that it is no longer registered."""
         self._made.pop(name, None)
         self._former.pop(name, None)
 
@@ -86,11 +86,11 @@ class Views:
         self._of_clouds: dict[NodeName, tuple[Peer, ...]] = {}
         self._permitted: dict[tuple[CallPermit, ...], tuple[Peer, ...]] = {}
         self._changes: dict[tuple[int, int], tuple[tuple[Peer, ...], tuple[Peer, ...]]] = {}
-        """By the identities of a former and of a present view: the former one, so that it stays, and what differs."""
+        """By the identities of a former and a present view: the former one, to keep it alive, and the differences."""
         self._servers: dict[Group, Mapping[NodeName, CallPermit]] = {}
 
     def peers_of(self, sidecar: Sidecar) -> tuple[Peer, ...]:
-        """The peers a sidecar is told of, by name."""
+        """Return the peers a sidecar is told of, by name."""
         if sidecar.role is Role.CLOUD:
             if sidecar.name not in self._of_clouds:
                 self._of_clouds[sidecar.name] = self._robots_for(sidecar)
@@ -105,7 +105,7 @@ class Views:
         return peers
 
     def servers_of(self, robot: NodeName) -> Mapping[NodeName, CallPermit]:
-        """The clouds a robot is told of, and what it may call there."""
+        """Return the clouds a robot is told of, and what it may call there."""
         group = self._permits.group(robot)
         servers = self._servers.get(group)
         if servers is None:
@@ -126,7 +126,7 @@ class Views:
         return peers
 
     def changes(self, before: tuple[Peer, ...], sidecar: Sidecar) -> tuple[Peer, ...]:
-        """The peers of a sidecar that are not as it was told of them `before`."""
+        """Return the peers of a sidecar that have changed since it was told `before`."""
         peers = self.peers_of(sidecar)
         found = self._changes.get((id(before), id(peers)))
         if found is None:
@@ -136,7 +136,7 @@ class Views:
         return found[1]
 
     def removed(self, sidecar: Sidecar, known_names: Collection[NodeName]) -> tuple[RemovedPeer, ...]:
-        """Notices on those a sidecar may know and should not list any more, with the reason, by name."""
+        """Return notices, by name, on those a sidecar may know and should no longer list, with the reason."""
         present = {peer.name for peer in self.peers_of(sidecar)}
         return tuple(
             RemovedPeer(name, self._reason(sidecar, name)) for name in sorted(known_names) if name not in present
