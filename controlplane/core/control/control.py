@@ -1,8 +1,8 @@
-"""The control plane without IO: messages of sidecars and time in, messages and closings of streams out.
+"""Runs the control plane without IO: messages of sidecars and time in, messages and closings of streams out.
 
-A driver calls `register`, `receive` and `disconnected` as streams come, speak and go, `handle_timer` when
-`next_timer` says so, and `start_solving`, `settle` and `solved` around the solver, which may run elsewhere meanwhile;
-after each call it drains `next_event`. Times are monotonic seconds.
+A driver calls `register`, `receive` and `disconnected` as streams begin, speak and end, `handle_timer` when
+`next_timer` says so, and `start_solving`, `settle` and `solved` around the solver, which may run elsewhere meanwhile.
+After each call it drains `next_event`. Times are monotonic seconds.
 """
 
 from __future__ import annotations
@@ -70,18 +70,18 @@ if TYPE_CHECKING:
     from protos.model.stream import SidecarMessage
 
 RESTLESS_DELAY_S = 1.0
-"""The same, for a member that comes and goes beyond its share."""
+"""Delay of publication for a member that comes and goes beyond its share."""
 
 PUBLISH_DELAY_S = 0.02
-"""From a change of the members to the sets that tell of it: a sidecar tells its addresses and its services in two
-messages, and these should make one version."""
+"""Delay from a change of the members to the sets that tell of it: a sidecar announces its addresses and its services in
+two messages, and these should make one version."""
 
 
 PUBLISH_DELAY_EACH_S = 50e-6
-"""The same, more for each sidecar: looking at one for news takes some tenth of it."""
+"""Additional delay for each sidecar: examining one for news takes some tenth of it."""
 
 PUBLISHED_AT_ONCE = 200
-"""Sidecars looked at for news in one go: some milliseconds, for which streams wait."""
+"""Sidecars examined for news in one go: some milliseconds, for which streams wait."""
 
 TOLD_AT_ONCE = 64
 """Sidecars told of a new revocation list in one go."""
@@ -104,7 +104,7 @@ class Settled:
 
 
 class ControlCore:
-    """Registry, estimator, plan and snapshots, put together."""
+    """Combines registry, estimator, plan and snapshots."""
 
     def __init__(self, settings: Settings, *, version_epoch: int, now: float) -> None:
         self._settings = settings
@@ -124,7 +124,7 @@ class ControlCore:
         self._drawing_since: float | None = None
         """When the drawing of the next problem began, None while none is drawn."""
         self.solves_routinely = False
-        """Whether the problem that `start_solving` gave last may take its time: nothing urgent waits for it."""
+        """Whether the problem last returned by `start_solving` may take its time: nothing urgent waits for it."""
         self._debounce = Debounce()
         self._stability = Stability()
         self.history = MappingHistory()
@@ -137,7 +137,7 @@ class ControlCore:
         self._last_stream = 0
         self._crl = b""
         self._untold: deque[NodeName] = deque()
-        """Who does not have it yet."""
+        """Sidecars that do not have it yet."""
         self._untold_since = now
         self._refused_offers = RefusedOffers()
         self.restlessness = Restlessness()
@@ -146,14 +146,14 @@ class ControlCore:
         self.unanswered = Unanswered()
         self._publish_at: float | None = None
         self._publications: deque[Iterator[Send | None]] = deque()
-        """Begun, and told to some; the first one goes on first."""
+        """Publications begun, and told to some; the first one continues first."""
         self._publishing_since = now
         self._events: deque[Event] = deque()
 
     # ── streams ──
 
     def register(self, registration: Registration, now: float) -> StreamId | Refusal:
-        """A stream begins with this registration; returns its number, or why it may not."""
+        """Begin a stream with this registration; return its number, or why it is refused."""
         stream = StreamId(self._last_stream + 1)
         before = self.registry.get(registration.name)
         result = self.registry.register(registration, stream, now)
@@ -179,13 +179,13 @@ class ControlCore:
         return stream
 
     def receive(self, stream: StreamId, message: SidecarMessage, now: float) -> None:
-        """Take one message of a stream. Raises DecodeError on one that has no place there."""
+        """Take one message of a stream. Raise DecodeError on one that has no place there."""
         name = self._streams.get(stream)
         if name is None or not self.registry.touch(name, stream, now):
             self.counters.old_stream_messages += 1
             return
         if self.pacing.worth_telling(self._told_intervals[name], now):
-            # Along with what is said anyway: to tell all of them at once would hold up everything else.
+            # Along with what is said anyway: telling all of them at once would hold up everything else.
             self._welcome(name, stream)
         match message:
             case Registration():
@@ -214,7 +214,7 @@ class ControlCore:
                 assert_never(message)
 
     def _sayable(self, name: NodeName, told: CandidateSet | ServiceSet) -> CandidateSet | ServiceSet:
-        """What a member announces, without what a robot says that it offers: nobody calls robots."""
+        """Return what a member announces, without a robot's offers: nobody calls robots."""
         sidecar = self.registry.get(name)
         if isinstance(told, ServiceSet) and told.offers and sidecar is not None and sidecar.role is Role.ROBOT:
             self.counters.robot_offers_ignored += len(told.offers)
@@ -222,7 +222,7 @@ class ControlCore:
         return told
 
     def _told_bytes(self, name: NodeName, told: Iterable[CandidateSet | ServiceSet]) -> int:
-        """How many bytes each who is told of a member is told if it announces this; 0 if it is no news to them."""
+        """Return how many bytes each listener is told of a member if it announces this; 0 if it is no news."""
         known = self.registry.get(name)
         if known is None:
             return 0
@@ -232,7 +232,7 @@ class ControlCore:
         return 0 if known.ready and after.as_peer() == known.as_peer() else after.told_bytes
 
     def _tell_anew(self, name: NodeName, before: Sidecar | None, now: float) -> None:
-        """A member has registered: others are told what it has said before, if that is within its share."""
+        """Note that a member has registered: others are told what it said before, if that is within its share."""
         sidecar = self.registry.get(name)
         if sidecar is None or before is None or sidecar.as_peer() == before.as_peer():
             return
@@ -267,7 +267,7 @@ class ControlCore:
             self.counters.reports_ignored += 1
             return
         self._note_goodbyes(name, report.goodbyes)
-        # Before the rest: after a restart a robot reports on servers that are not back yet.
+        # This comes first: after a restart a robot reports on servers that are not back yet.
         reaches_again = not (report.more or report.changes_only) and self._publisher.waits_for(
             name, report.servers_before.union(path.server for path in report.paths)
         )
@@ -292,7 +292,7 @@ class ControlCore:
             self._publish_soon(now)
 
     def _note_goodbyes(self, robot: NodeName, servers: Iterable[NodeName]) -> None:
-        """What a robot knows of those that went while the control plane was away, and that it may call."""
+        """Take what a robot knows of servers that left while the control plane was away, and that it may call."""
         could_say = None
         for name in servers:
             if not self.permits.may_know(robot, name):
@@ -307,7 +307,7 @@ class ControlCore:
                     self._events.append(DepartureNotice(name, judged))
 
     def _could_say(self) -> Callable[[NodeName], int]:
-        """Returns what tells how many of the robots that are there may call a server."""
+        """Return a function that counts the present robots that may call a server."""
         groups = Counter(self.permits.group(one.name) for one in self.registry if one.role is Role.ROBOT)
         may_know = self.permits.group_may_know
         return lambda server: sum(count for group, count in groups.items() if may_know(group, server))
@@ -338,38 +338,38 @@ class ControlCore:
         self._events.append(Send(stream, welcome))
 
     def follow_load(self, now: float, busy: float | None = None) -> None:
-        """Let sidecars report as often as their number allows, and `busy`: the share of one core used lately.
+        """Let sidecars report as often as their number and `busy` allow: the share of one core used recently.
 
-        After a restart those who are still to come back count too: each is told once how often.
+        After a restart, those still to come back count too: so each is told its interval once.
         """
         self.pacing.follow(len(self.registry) + len(self._returning), now, busy)
         self.registry.lease_s = self.pacing.lease_s
 
     def relay_revocations(self, crl: bytes, now: float) -> None:
-        """Pass this list (PEM) on to all: a sidecar may know peers that this run of ours has never heard of."""
+        """Pass this list (PEM) on to all: a sidecar may know peers that this run has never heard of."""
         if crl == self._crl:
             return
         self._crl = crl
-        # Who comes from now on is told in its own welcome.
+        # Sidecars that come from now on are told in their own welcome.
         self._untold = deque(sidecar.name for sidecar in self.registry)
         self._untold_since = now
         self._tell_revocations()
 
     def _tell_revocations(self) -> None:
-        """Tell some of those who do not have the list yet; `next_timer` is past until all have been told."""
+        """Tell some of those without the list; `next_timer` is past until all have been told."""
         for _ in range(min(TOLD_AT_ONCE, len(self._untold))):
             sidecar = self.registry.get(self._untold.popleft())
             if sidecar is not None and sidecar.stream is not None:
                 self._welcome(sidecar.name, sidecar.stream)
 
     def refuse(self, refusal: Refusal) -> Refusal:
-        """Count a registration that the driver does not let in; returns its reason."""
+        """Count a registration that the driver refuses; return its reason."""
         self.registry.counters.refused[refusal] += 1
         return refusal
 
     def part_with(self, name: NodeName, reason: RemovalReason, now: float) -> None:
-        """This sidecar must not be talked to any more: it goes at once, and its peers are told so from now on, some
-        with each call of `handle_timer`."""
+        """Remove a sidecar that must not be talked to any more. Its peers are told so from now on, some with each call
+        of `handle_timer`."""
         sidecar = self.registry.remove(name, reason)
         if sidecar is None:
             return
@@ -380,7 +380,7 @@ class ControlCore:
         self._publish_at = now
 
     def end_stream(self, name: NodeName, reason: CloseReason, now: float) -> None:
-        """End a sidecar's stream; unless it was about to go, it stays registered until its lease ends."""
+        """End a sidecar's stream; unless it was about to leave, it stays registered until its lease ends."""
         sidecar = self.registry.get(name)
         if sidecar is not None:
             self._close(sidecar.stream, reason, now)
@@ -392,7 +392,7 @@ class ControlCore:
             self.disconnected(stream, now)
 
     def disconnected(self, stream: StreamId, now: float) -> None:
-        """A stream ended, whoever ended it: the only way in which one does. No news if it had ended before."""
+        """Note that a stream ended, whoever ended it: the only way one does. Ignore one that had ended before."""
         name = self._streams.pop(stream, None)
         sidecar = self.registry.get(name) if name is not None else None
         if name is None or sidecar is None:
@@ -406,7 +406,7 @@ class ControlCore:
     # ── policy ──
 
     def set_policy(self, policy: Policy | None, now: float) -> None:
-        """Another policy is in force: everybody is told what changes for them."""
+        """Put another policy in force: everybody is told what changes for them."""
         alone = cut_off(self.registry, self.permits)
         self.permits = Permits(policy)
         self._note_cut_off(alone, cut_off(self.registry, self.permits), now)
@@ -442,7 +442,7 @@ class ControlCore:
     # ── time ──
 
     def next_timer(self) -> float | None:
-        """When to call `handle_timer` and `start_solving` next."""
+        """Return when to call `handle_timer` and `start_solving` next."""
         times = (
             self.registry.next_expiry(),
             self._publish_at,
@@ -461,7 +461,7 @@ class ControlCore:
     def handle_timer(self, now: float, unread: Collection[NodeName] = ()) -> None:
         """Let leases end, and publish what changed.
 
-        `unread`: those of `registry.due` of whom the driver has something that it has not passed on yet.
+        `unread` are those of `registry.due` from whom the driver holds something that it has not passed on yet.
         """
         for sidecar in self.registry.expire(now, unread):
             self._close(sidecar.stream, CloseReason.LEASE_EXPIRED, now)
@@ -490,7 +490,8 @@ class ControlCore:
         self._tell_revocations()
 
     def remember(self, departures: Iterable[Departure], present: Iterable[Departure], now: float) -> None:
-        """What an earlier run knew: who was gone, and who was there; of these who does not come back is gone."""
+        """Remember what an earlier run knew: who was gone, and who was there; of these, those not back in time are
+        gone."""
         for gone in departures:
             self.departed.note(gone)
         self._returning.expect(present, now + self._settings.warm_up_s + self._settings.lease_s)
@@ -527,13 +528,13 @@ class ControlCore:
         self._drawing.robot_changed(name)
 
     def _members_changed(self, now: float, role: Role = Role.CLOUD) -> None:
-        """Those of this role did, or what is as much as that."""
+        """Note that members of this role changed, or something equivalent."""
         self._drawing.members_changed()
         self._debounce.note(Change.ROBOTS if role is Role.ROBOT else Change.MEMBERS, now)
         self._publish_soon(now)
 
     def _came_or_went(self, name: NodeName, role: Role, now: float) -> None:
-        """By its own will: beyond its share that is told a little later, and not solved for at once."""
+        """Note that a member came or left by its own will: beyond its share told later, and not solved for at once."""
         if self.restlessness.take(name, now):
             self._members_changed(now, role)
             return
@@ -549,7 +550,7 @@ class ControlCore:
     # ── solving ──
 
     def start_solving(self, now: float) -> Picture | None:
-        """The problem to solve now, if it is time to and the problem is drawn; `solved` has to follow.
+        """Return the problem to solve now, if it is due and drawn; `solved` has to follow.
 
         Drawing takes several calls in a large fleet: until it is done `next_timer` stays in the past.
         """
@@ -560,7 +561,7 @@ class ControlCore:
             self._drawing_since = now
             self.solves_routinely = change is Change.REPORT
             self._drawing.begin(routine=self.solves_routinely)
-        # Who waits for its servers has a mapping; what is made of nothing known must not take its place.
+        # A robot that waits for its servers has a mapping; one made from no knowledge must not take its place.
         waits = self._publisher.waits
         ready = (sidecar for sidecar in self.registry if sidecar.ready and not waits(sidecar.name))
         if not self._drawing.advance(ready, self.permits, self.estimator, now, self._lost_share):
@@ -573,7 +574,7 @@ class ControlCore:
         return self._drawing.picture()
 
     def _lost_share(self, robot: NodeName) -> float:
-        """The share of a robot's assignments whose paths are not up."""
+        """Return the share of a robot's assignments whose paths are not up."""
         sidecar = self.registry.get(robot)
         if sidecar is None:
             return 0.0
@@ -583,9 +584,9 @@ class ControlCore:
         return lost / len(pairs) if pairs else 0.0
 
     def settle(self, picture: Picture, plan: Plan, now: float) -> Settled:
-        """Decide what of the solver's answer is worth a change, for `solved`.
+        """Decide which parts of the solver's answer are worth a change, for `solved`.
 
-        It changes nothing that other calls look at, so it may run on another thread between `start_solving` and
+        This changes nothing that other calls look at, so it may run on another thread between `start_solving` and
         `solved`: for a large fleet it takes as long as some hundred reports.
         """
         settled = self._stability.settle(picture.problem, plan, self.plan, now)
@@ -593,7 +594,7 @@ class ControlCore:
         return Settled(picture, settled, changed_robots(self.plan, settled, self._picture, picture), plan.unproven)
 
     def solved(self, settled: Settled, now: float) -> None:
-        """The answer to the problem of `start_solving`, settled: what is new is published."""
+        """Take the settled answer to the problem of `start_solving`, and publish what is new."""
         self._debounce.finished(now)
         plan = settled.plan
         self.counters.solved += 1
@@ -611,7 +612,7 @@ class ControlCore:
             self._publish(now)
 
     def solving_failed(self, now: float) -> None:
-        """The solver raised: the plan in force stays, and it is tried again with the next routine solving."""
+        """Note that the solver raised: the plan in force stays, and the next routine solving tries again."""
         self._debounce.finished(now)
         self._debounce.note(Change.REPORT, now)
 
@@ -629,7 +630,7 @@ class ControlCore:
             self._go_on_publishing(now)
 
     def _go_on_publishing(self, now: float) -> None:
-        """Look for news at some sidecars; `next_timer` is past until all are done."""
+        """Examine some sidecars for news; `next_timer` is past until all are done."""
         looked_at = 0
         for send in self._publications[0]:
             if send is None:
@@ -647,20 +648,20 @@ class ControlCore:
             self._events.append(send)
 
     def next_event(self) -> Event | None:
-        """What the driver has to do next."""
+        """Return what the driver has to do next."""
         return self._events.popleft() if self._events else None
 
     # ── what the operator sees ──
 
     @property
     def shares_forgotten(self) -> int:
-        """Members whose share of something began afresh for want of room."""
+        """Members whose share of something was reset for lack of room."""
         return self.registry.shares_forgotten + self.restlessness.shares.forgotten + self.urgency.shares.forgotten
 
     def status(
         self, now: float, names: Iterable[NodeName] | None = None, *, abridged: bool = False
     ) -> list[SidecarStatus]:
-        """Every registered sidecar by name, or those of these names; `abridged`: shorter where all is in order."""
+        """Return every registered sidecar by name, or those of these names; `abridged`: shorter if all is in order."""
         if names is None:
             names = sorted(sidecar.name for sidecar in self.registry)
         return list(
@@ -677,7 +678,7 @@ class ControlCore:
         )
 
     def explain(self, robot: NodeName, service: ServiceName, now: float) -> Explanation:
-        """Why requests go where they go, or went. Raises UnknownNameError if robot or service is not known."""
+        """Explain why requests go, or went, where they do. Raise UnknownNameError if robot or service is unknown."""
         gone = self.departed.get(robot)
         if gone is not None and gone.role is Role.ROBOT and self.registry.get(robot) is None:
             last = self.departed.last_known(robot)
@@ -697,11 +698,11 @@ class ControlCore:
         )
 
     def sync_states(self) -> Iterator[tuple[NodeName, ResourceKind, SyncState]]:
-        """How far every registered sidecar follows; clouds get no mapping."""
+        """Yield how far every registered sidecar follows; clouds get no mapping."""
         return self._publisher.sync_states()
 
     def view(self, name: NodeName, now: float) -> MemberView | None:
-        """What the metrics tell of a member; None if it is not there any more."""
+        """Return what the metrics tell of a member; None if it is no longer present."""
         sidecar = self.registry.get(name)
         if sidecar is None:
             return None

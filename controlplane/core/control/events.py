@@ -1,4 +1,4 @@
-"""What goes into the core beside messages, and what comes out of it."""
+"""Defines what goes into the core besides messages, and what comes out of it."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class Settings:
-    """What the configuration decides."""
+    """Settings from the configuration."""
 
     lease_s: float = 5.0
     report_interval_s: float = 0.5
@@ -34,25 +34,25 @@ class Settings:
 
 @dataclass(slots=True)
 class Counters:
-    """What happened, for the metrics."""
+    """Counts what happened, for the metrics."""
 
     nacks: Counter[ResourceKind] = field(default_factory=Counter)
     acks: Counter[ResourceKind] = field(default_factory=Counter)
     stale_answers: int = 0
-    """Acks and nacks with a nonce that is not the last one's."""
+    """Acks and nacks whose nonce is not the last one's."""
     reports: int = 0
     reports_ignored: int = 0
     """Reports of clouds, which measure nothing."""
     robot_offers_ignored: int = 0
-    """Services that robots say to serve: nobody calls robots."""
+    """Services that robots claim to serve: nobody calls robots."""
     report_entries_forbidden: int = 0
-    """Of robots about servers or services that they may not use."""
+    """Entries of robots' reports about servers or services that they may not use."""
     interfaces_left_out: int = 0
-    """Announced by robots beyond those that any mapping is sought among."""
+    """Interfaces announced by robots beyond those that any mapping may use."""
     old_stream_messages: int = 0
-    """Messages on a stream that is not the sidecar's any more."""
+    """Messages on a stream that no longer is the sidecar's."""
     offers_refused: int = 0
-    """Offers that became known and which the policy does not let their clouds make."""
+    """Newly known offers that the policy does not let their clouds make."""
     solved: int = 0
     relaxations: int = 0
     """Plans taken that exceed a capacity."""
@@ -70,7 +70,7 @@ class NackNotice:
 
 @dataclass(frozen=True, slots=True)
 class DepartureNotice:
-    """A sidecar is not there any more, for the log."""
+    """A sidecar is no longer present, for the log."""
 
     sidecar: NodeName
     departure: Departure
@@ -78,7 +78,7 @@ class DepartureNotice:
 
 @dataclass(frozen=True, slots=True)
 class StreamLostNotice:
-    """A sidecar's stream ended, and its lease has not, for the log of events."""
+    """A sidecar's stream ended but its lease has not, for the log of events."""
 
     sidecar: NodeName
     role: Role
@@ -86,7 +86,7 @@ class StreamLostNotice:
 
 @dataclass(frozen=True, slots=True)
 class CutOffNotice:
-    """Another policy leaves a sidecar nobody to talk to; or somebody again (`lifted`)."""
+    """Another policy leaves a sidecar nobody to talk to, or somebody again (`lifted`)."""
 
     sidecar: NodeName
     role: Role
@@ -95,7 +95,7 @@ class CutOffNotice:
 
 @dataclass(frozen=True, slots=True)
 class UnmetNotice:
-    """A sidecar's configuration names services that nobody serves; told when these are others than before."""
+    """A sidecar's configuration names services that nobody serves; told when they differ from before."""
 
     sidecar: NodeName
     services: tuple[ServiceName, ...]

@@ -1,27 +1,27 @@
-"""When to solve again."""
+"""Decides when to solve again."""
 
 from __future__ import annotations
 
 import enum
 
 URGENT_DELAY_S = 0.05
-"""From a path's or a sidecar's coming or going to the next solving: time for what comes along with it (both
-interfaces of a robot that enters a tunnel), and little beside the second a human would notice."""
+"""Delay from a path or sidecar coming or going to the next solving: time for what comes along with it (both interfaces
+of a robot that enters a tunnel), and little compared with the second a human would notice."""
 
 ROUTINE_INTERVAL_S = 1.0
-"""Between two solvings for the sake of new reports alone: estimates follow reports, which come twice a second,
-and solving a large fleet takes about this long."""
+"""Interval between two solvings because of new reports alone: estimates follow reports, which come twice a second, and
+solving a large fleet takes about this long."""
 
 ROUTINE_TIMES = 10.0
 """Routine solvings of a large fleet start this many times their own duration apart, to leave time for the rest."""
 
 ROBOTS_TIMES = 4.0
-"""So many times as long as the last solving took, robots that come wait for the next one. A fleet that comes back keeps
-its mappings meanwhile; each solving looks at all who are there, so one for every few who come would cost the more for
-each of them the more there are."""
+"""Robots that come wait for the next solving for this many times the last one's duration. A returning fleet keeps its
+mappings meanwhile. Each solving examines everybody, so the more robots are present, the more one solving for every few
+newcomers would cost per newcomer."""
 
 ROBOTS_WAIT_S = 2.0
-"""They wait no longer than this."""
+"""Maximum time that they wait."""
 
 
 class Change(enum.Enum):
@@ -54,7 +54,7 @@ class Debounce:
         self._running = False
 
     def note(self, change: Change, now: float) -> None:
-        """The picture changed."""
+        """Note that the picture changed."""
         if change is Change.REPORT:
             self._reported_at = self._reported_at if self._reported_at is not None else now
         elif change is Change.ROBOTS:
@@ -65,12 +65,12 @@ class Debounce:
             self._urgent_at = now + URGENT_DELAY_S
 
     def go_on(self, now: float) -> None:
-        """The solving that is under way is not for everything urgent: the next one follows at once."""
+        """Note that the present solving does not cover everything urgent: the next one follows at once."""
         self._urgent = self._urgent or Change.PATH
         self._urgent_at = now
 
     def next_time(self) -> float | None:
-        """When to solve; None while nothing changed, or while a solving runs."""
+        """Return when to solve; None while nothing has changed, or while a solving runs."""
         if self._running:
             return None
         times = [self._urgent_at] if self._urgent is not None else []
@@ -81,7 +81,7 @@ class Debounce:
         return min(times, default=None)
 
     def start(self, now: float) -> Change | None:
-        """What to solve for now, if anything; then `finished` has to follow. `REPORT`: for everything."""
+        """Return what to solve for now, if anything; `finished` has to follow. `REPORT`: for everything."""
         due = self.next_time()
         if due is None or due > now:
             return None
@@ -96,7 +96,7 @@ class Debounce:
         return change
 
     def finished(self, now: float) -> None:
-        """The solving that `start` began has ended."""
+        """Note that the solving that `start` began has ended."""
         self._running = False
         took_s = now - self._started
         self._next_routine = max(self._next_routine, self._started + ROUTINE_TIMES * took_s)
