@@ -1,4 +1,4 @@
-"""Answers for the operator: why a mapping is as it is, who is there, who is gone.
+"""Answers the operator: why a mapping is as it is, who is present, who is gone.
 
 Imports everything but `settle` and `control`.
 """

@@ -1,4 +1,4 @@
-"""What other mappings of one robot's service would give, and what speaks against those that look better."""
+"""Computes what other mappings of one robot's service would give, and what speaks against those that look better."""
 
 from __future__ import annotations
 
@@ -26,12 +26,12 @@ if TYPE_CHECKING:
     from protos.model.ids import NodeName
 
 OTHERS = 3
-"""Best mappings told of that are not in force."""
+"""Number of the best mappings reported that are not in force."""
 
 
 def of(problem: Problem, plan: Plan, block: Block, miss: Callable[[Block, Choice], float]) -> tuple[Alternative, ...]:
-    """The best other mappings of the block, each interface alone, and the block without each server in use; `miss`
-    says what requests miss with a choice."""
+    """Return the best other mappings of the block, each interface alone, and the block without each server in use;
+    `miss` tells what requests miss with a choice."""
     running = choice_of(block, plan.blocks.get(block.key))
     return _Alternatives(problem, plan, block, running, miss).all()
 
@@ -116,7 +116,7 @@ class _Alternatives:
 
 
 def _taken_by_others(problem: Problem, plan: Plan, block: Block) -> Counter[NodeName]:
-    """Interfaces of other robots that each server serves for this service."""
+    """Return how many interfaces of other robots each server serves for this service."""
     return Counter(
         server
         for key, other in plan.blocks.items()

@@ -1,7 +1,7 @@
-"""Who is gone, why, and what was known last: it is needed just when it would be forgotten.
+"""Remembers who is gone, why, and what was last known: it is needed just when it would be forgotten.
 
-Each name has one entry, so that no member can push out others', however often it goes. What was known of a departed
-robot (its last mapping, what that rested on, its paths) is kept by reference, of the last ones only. Times are
+Each name has one entry, so that no member can push out others', however often it leaves. What was known of a departed
+robot (its last mapping, what that rested on, its paths) is kept by reference, for the last ones only. Times are
 monotonic seconds.
 """
 
@@ -30,10 +30,10 @@ if TYPE_CHECKING:
     from protos.model.status import ResourceStatus
 
 MAX_DEPARTED = 4096
-"""Sidecars that are gone and remembered, who went longest ago goes: as many as can be registered."""
+"""Departed sidecars remembered, as many as can be registered; the one that left longest ago is evicted."""
 
 MAX_EXPLAINED = 256
-"""Of these, robots whose last mapping can be explained; who went longest ago goes."""
+"""Of these, robots whose last mapping can be explained; the one that left longest ago is evicted."""
 
 MAX_PATHS_KEPT = 64
 """Paths kept of a departed robot, with their round trips (8 kB each): 8 interfaces to 8 servers."""
@@ -42,7 +42,7 @@ MAX_SERVICES_KEPT = 64
 """Services whose last mapping is kept of a departed robot."""
 
 MAX_SERVICES_TOLD = 16
-"""Services named of one that is gone."""
+"""Services named of a departed sidecar."""
 
 _WHY = {
     RemovalReason.LEASE_EXPIRED: Why.LEASE_EXPIRED,
@@ -55,7 +55,7 @@ _WHY = {
 
 @dataclass(frozen=True, slots=True)
 class LastKnown:
-    """What a robot's mapping was, and what it rested on, when it went."""
+    """What a robot's mapping was, and what it rested on, when it left."""
 
     sidecar: Sidecar
     paths: Mapping[tuple[InterfaceName, NodeName], PathState]
@@ -68,14 +68,14 @@ class LastKnown:
 
 @dataclass(frozen=True, slots=True)
 class Departure:
-    """One that is gone."""
+    """A sidecar that is gone."""
 
     name: NodeName
     role: Role
     why: Why
     at: float
     seen_at: float
-    """When it was heard of last."""
+    """When it was last heard of."""
     text: str = ""
     software_version: str = ""
     services: tuple[ServiceName, ...] = ()
@@ -88,7 +88,7 @@ def last_known(
     picture: Picture,
     plan: Plan,
 ) -> LastKnown:
-    """Gather it, before it is forgotten elsewhere; references only, as many may go at once."""
+    """Gather it before it is forgotten elsewhere; keep references only, as many may leave at once."""
     keys = [BlockKey(robot.name, use.name) for use in robot.uses[:MAX_SERVICES_KEPT]]
     return LastKnown(
         sidecar=robot,
@@ -102,7 +102,7 @@ def last_known(
 
 
 def departure(sidecar: Sidecar, why: Why, text: str, *, at: float, seen_at: float) -> Departure:
-    """Note down one that was registered until now."""
+    """Record the departure of a sidecar that was registered until now."""
     names = [offer.name for offer in sidecar.offers] + [use.name for use in sidecar.uses]
     return Departure(
         name=sidecar.name,
@@ -117,14 +117,14 @@ def departure(sidecar: Sidecar, why: Why, text: str, *, at: float, seen_at: floa
 
 
 def why_removed(sidecar: Sidecar, reason: RemovalReason) -> Why:
-    """The reason in the operator's words."""
+    """Return the reason in the operator's words."""
     if reason is RemovalReason.LEASE_EXPIRED and sidecar.draining:
         return Why.LEFT
     return _WHY[reason]
 
 
 class Departed:
-    """Everybody who is gone, as far as is remembered."""
+    """All sidecars that are gone, as far as remembered."""
 
     def __init__(self) -> None:
         self._departures: OrderedDict[NodeName, Departure] = OrderedDict()
@@ -139,7 +139,7 @@ class Departed:
         return iter(self._departures.values())
 
     def note(self, gone: Departure, last: LastKnown | None = None) -> None:
-        """Somebody is gone."""
+        """Note that a sidecar is gone."""
         self.forget(gone.name)
         self._departures[gone.name] = gone
         if len(self._departures) > MAX_DEPARTED:
@@ -152,20 +152,20 @@ class Departed:
                 self._last_known.popitem(last=False)
 
     def forget(self, name: NodeName) -> Departure | None:
-        """It is back; returns what was noted of it."""
+        """Forget a sidecar that is back; return what was noted of it."""
         self._last_known.pop(name, None)
         return self._departures.pop(name, None)
 
     def get(self, name: NodeName) -> Departure | None:
-        """What is remembered of a departure."""
+        """Return what is remembered of a departure."""
         return self._departures.get(name)
 
     def last_known(self, name: NodeName) -> LastKnown | None:
-        """What was known of a robot when it went; None if that is forgotten."""
+        """Return what was known of a robot when it left; None if that is forgotten."""
         return self._last_known.get(name)
 
     def told(self, now: float, limit: int) -> tuple[DepartedSidecar, ...]:
-        """The last ones for the operator, who went last first."""
+        """Return the last departures for the operator, the latest first."""
         return tuple(
             DepartedSidecar(
                 name=gone.name,

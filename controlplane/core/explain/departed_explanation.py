@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 
 class _LastEstimates:
-    """What was measured, as of the robot's departure: it does not fade, but for what others say of the servers."""
+    """What was measured, as of the robot's departure: it does not fade, except for what others say of the servers."""
 
     def __init__(self, estimator: Estimator, last: LastKnown, now: float) -> None:
         self._estimator = estimator
@@ -64,7 +64,7 @@ def explain_departed(
     history: MappingHistory,
     now: float,
 ) -> Explanation:
-    """Explain it; its times count from the departure. Raises UnknownNameError if it is forgotten, or knew none such."""
+    """Explain it; its times count from the departure. Raise UnknownNameError if it is forgotten, or knew none such."""
     if last is None:
         raise UnknownNameError(
             f"{gone.name} is gone ({gone.why.value}), and what was known of it is forgotten; see: plr events --node "

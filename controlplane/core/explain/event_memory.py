@@ -1,6 +1,5 @@
-"""The last events of the fleet. When they are too many, whoever has most of them loses its oldest: no member, however
-restless, pushes out what is known of others.
-"""
+"""Remembers the last events of the fleet. When they are too many, the member with most of them loses its oldest: no
+member, however restless, pushes out what is known of others."""
 
 from __future__ import annotations
 
@@ -24,7 +23,7 @@ EVENTS_BURST = 64.0
 """Events of one member taken at once: a bad hour."""
 
 EVENTS_PER_S = 1.0 / 30.0
-"""After that; each is written to the disk."""
+"""Rate after that; each event is written to the disk."""
 
 
 class EventMemory:
@@ -34,10 +33,10 @@ class EventMemory:
         self._events: OrderedDict[int, FleetEvent] = OrderedDict()
         self._of: dict[Owner, deque[int]] = {}
         self._holders: dict[int, OrderedDict[Owner, None]] = {}
-        """Who has so many events, by that number."""
+        """Owners that have this many events, by that number."""
         self._most = 0
         self._shares: dict[Owner, TokenBucket] = {}
-        """Of those who have events: so there are no more of them than events."""
+        """Shares of those who have events, so that there are no more shares than events."""
         self.evicted = 0
         self.too_often = 0
 
@@ -49,21 +48,21 @@ class EventMemory:
 
     @property
     def last_number(self) -> int:
-        """Of the newest event; 0 without any."""
+        """Number of the newest event; 0 without any."""
         return next(reversed(self._events), 0)
 
     def last(self, count: int) -> list[FleetEvent]:
-        """The last ones, the oldest first."""
+        """Return the last events, the oldest first."""
         return [*islice(reversed(self._events.values()), count)][::-1]
 
     def admits(self, owner: Owner, now: float) -> bool:
-        """Whether one more event of this member is within its share, as the control plane's own always are; `now` in
-        monotonic seconds."""
+        """Return whether one more event of this member is within its share; the control plane's own always are. `now`
+        is in monotonic seconds."""
         if owner is None:
             return True
         share = self._shares.get(owner)
         if share is None:
-            # Held from its first event on.
+            # Kept from its first event on.
             share = TokenBucket(rate=EVENTS_PER_S, burst=EVENTS_BURST, now=now)
             if owner in self._of:
                 self._shares[owner] = share
@@ -73,7 +72,7 @@ class EventMemory:
         return False
 
     def add(self, event: FleetEvent) -> None:
-        """Keep one whose number is above all others'."""
+        """Keep an event whose number is above all others'."""
         self._events[event.number] = event
         own = self._of.setdefault(event.node, deque())
         self._count(event.node, len(own), len(own) + 1)

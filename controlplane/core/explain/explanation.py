@@ -1,6 +1,6 @@
-"""Why a robot's service goes where it goes, out of what the control plane decided by: its picture and its plan.
+"""Explains why a robot's service goes where it goes, from what the control plane decided by: its picture and its plan.
 
-Nothing here decides anything, and no epsilon is estimated anew: the explanation is of the mapping in force.
+Nothing here decides anything, and no epsilon is estimated again: the explanation is of the mapping in force.
 """
 
 from __future__ import annotations
@@ -36,13 +36,13 @@ if TYPE_CHECKING:
     from protos.model.status import ResourceStatus
 
 LEVEL = 0.9
-"""Of the intervals told with a probability."""
+"""Probability of the reported intervals."""
 
 MIN_COMMON_REQUESTS = 20.0
-"""Requests over two interfaces below which nothing is told of these."""
+"""Requests over two interfaces below which nothing is reported of these."""
 
 MAX_PAIRS = 1024
-"""Pairs told of, those in use and then the best ones: what the estimator keeps of one robot."""
+"""Pairs reported, those in use and then the best ones: what the estimator keeps of one robot."""
 
 
 class UnknownNameError(Exception):
@@ -50,28 +50,28 @@ class UnknownNameError(Exception):
 
 
 class Measured(Protocol):
-    """What the estimator knows, or knew of a robot when it went."""
+    """What the estimator knows, or knew of a robot when it left."""
 
     def path_up(self, robot: NodeName, interface: InterfaceName, server: NodeName) -> bool | None:
-        """Whether a path was up when last reported."""
+        """Return whether a path was up when last reported."""
 
     def penalties(self, robot: NodeName, now: float) -> Mapping[NodeName, PenaltyReport]:
-        """Servers that the robot asks only where it has no other."""
+        """Return the servers that the robot asks only as a last resort."""
 
     def observed_miss_ratio(self, robot: NodeName, service: ServiceName, now: float) -> float | None:
-        """Share of the recent requests that missed."""
+        """Return the share of the recent requests that missed."""
 
     def evidence(self, robot: NodeName, path: Assignment, service: ServiceName, now: float) -> Evidence:
-        """What was measured on a pair."""
+        """Return what was measured on a pair."""
 
     def common_misses(
         self, robot: NodeName, service: ServiceName, now: float
     ) -> Iterator[tuple[InterfaceName, InterfaceName, NodeName | None, CommonMisses]]:
-        """The pairs of interfaces that carried copies of the same requests."""
+        """Yield the pairs of interfaces that carried copies of the same requests."""
 
 
 def find(registry: Registry, permits: Permits, robot: NodeName, service: ServiceName) -> tuple[Sidecar, ServiceUse]:
-    """The robot and its use of the service. Raises UnknownNameError."""
+    """Return the robot and its use of the service. Raise UnknownNameError if there is none."""
     sidecar = registry.get(robot)
     if sidecar is None:
         robots = (other.name for other in registry if other.role is Role.ROBOT)
@@ -92,8 +92,8 @@ def find(registry: Registry, permits: Permits, robot: NodeName, service: Service
 def find_use(
     robot: Sidecar, service: ServiceName, offered: Collection[ServiceName] = (), clouds: int = 0
 ) -> ServiceUse:
-    """The robot's use of the service; `offered` is what any cloud offers, `clouds` how many let it call this service.
-    Raises UnknownNameError."""
+    """Return the robot's use of the service; `offered` is what any cloud offers, `clouds` how many let it call this
+    service. Raise UnknownNameError if there is none."""
     for use in robot.uses:
         if use.name == service:
             return use
@@ -144,7 +144,7 @@ def explain(
     history: History | None,
     now: float,
 ) -> Explanation:
-    """Explain the mapping that is in force for this use of this robot; `sent` and `sync`: what it was told last."""
+    """Explain the mapping in force for this use of this robot; `sent` and `sync` are what it was last told."""
     key = BlockKey(robot.name, use.name)
     block = next((block for block in picture.problem.blocks if block.key == key), None)
     mapping = next((found for found in sent if found.service == use.name), None)
@@ -179,7 +179,7 @@ def explain(
 def _paths(robot: Sidecar, picture: Picture, key: BlockKey, mapping: ServiceMapping | None) -> list[Assignment]:
     notes = picture.notes.get(key)
     live = notes.servers if notes is not None else ()
-    # What is in force may name a server that is gone since.
+    # The mapping in force may name a server that is gone since.
     mapped = (path.server for path in mapping.assignments) if mapping is not None else ()
     servers = dict.fromkeys((*live, *mapped))
     return [Assignment(interface, server) for interface in interfaces_of(robot) for server in servers]
@@ -264,7 +264,7 @@ def _joints(
 def _shared(
     block: Block | None, first: InterfaceName, second: InterfaceName, server: NodeName | None
 ) -> tuple[str, ...]:
-    """What copies over two interfaces have in common, the narrowest of each end."""
+    """Return what copies over two interfaces have in common, the narrowest of each end."""
     shared = []
     if (carrier := _carrier(block, first)) and carrier == _carrier(block, second):
         shared.append(f"carrier {carrier}")

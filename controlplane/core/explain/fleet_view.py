@@ -1,6 +1,5 @@
-"""What is known of one member, for the metrics: gathered quickly and by reference, so that it can be written down on
-another thread while the core goes on. Times are monotonic seconds.
-"""
+"""Gathers what is known of one member for the metrics, quickly and by reference, so that it can be written down on
+another thread while the core goes on. Times are monotonic seconds."""
 
 from __future__ import annotations
 
@@ -30,7 +29,7 @@ if TYPE_CHECKING:
     from protos.model.members import ServiceUse
 
 MAX_VIEWED = 512
-"""Paths, and services, of one robot that are looked at."""
+"""Paths, and services, of one robot that are examined."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,7 +38,7 @@ class InterfaceView:
 
     name: InterfaceName
     carrier: str
-    """Whose network it uses; its own name where that is not known."""
+    """Whose network it uses; its own name if that is unknown."""
     up: bool
     """Whether it carries anything, as the robot says."""
 
@@ -52,11 +51,11 @@ class MissView:
     predicted: float | None
     observed: float | None
     target: float
-    """What its configuration wants; 0: as few as can be."""
+    """What its configuration wants; 0: as few as possible."""
     requests: int
-    """That have ended ..."""
+    """Requests that have ended ..."""
     missed: int
-    """... and of these the ones that missed the deadline or failed."""
+    """... and those of them that missed the deadline or failed."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,9 +64,9 @@ class ServedView:
 
     service: ServiceName
     up: bool
-    """Whether a node beside its sidecar serves it now, or else is missed."""
+    """Whether a node beside its sidecar serves it now; otherwise it is missed."""
     unanswered: int
-    """Requests, of those that robots measure, that it had since its last answer and did not answer."""
+    """Measured requests that it received since its last answer and did not answer."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,19 +82,19 @@ class MemberView:
     misses: tuple[MissView, ...] = ()
     interfaces: tuple[InterfaceView, ...] = ()
     paths_of_services: tuple[tuple[ServiceName, int], ...] = ()
-    """Over how many paths requests go, of each service that it was told of or cannot have."""
+    """Over how many paths requests go, for each service that it was told of or cannot have."""
     lost: frozenset[NodeName] = frozenset()
-    """Servers that it does not reach, and did."""
+    """Servers that it does not reach but once did."""
     unproven: frozenset[NodeName] = frozenset()
     """Servers that it does not reach, and nobody ever has."""
     doubted: frozenset[NodeName] = frozenset()
-    """Servers that it has never reached, and one other robot alone says that it did."""
+    """Servers that it has never reached, and that only one other robot claims to have reached."""
     follows: bool = True
-    """Whether it has confirmed the mapping that it was sent last, if there is one."""
+    """Whether it has confirmed the mapping that it was last sent, if there is one."""
     servers: int = 0
-    """How many servers a robot was told of: registered, and the policy lets it call something there."""
+    """How many servers a robot was told of: registered ones on which the policy lets it call something."""
     served: tuple[ServedView, ...] = ()
-    """Of a server that is not about to go: what it serves, and before that what it should."""
+    """What a server that is not about to leave serves, preceded by what it should serve but does not."""
 
 
 def view_of(
@@ -113,15 +112,15 @@ def view_of(
     seen_at: float,
     now: float,
 ) -> MemberView:
-    """Look at one; some 40 us for a robot with 15 paths. `is_there` tells which servers the robot has to
-    do with, `is_offered` which services a cloud that it may call offers, `may_offer` which ones the policy lets a cloud
+    """Examine one member; some 40 us for a robot with 15 paths. `is_there` tells which servers the robot has to do
+    with, `is_offered` which services a cloud that it may call offers, `may_offer` which ones the policy lets a cloud
     offer."""
     connected = sidecar.stream is not None
     if sidecar.role is not Role.ROBOT:
         served = _served(sidecar, lambda service: unanswered.row(sidecar.name, service, now), may_offer)
         return MemberView(sidecar.name, sidecar.role, connected, seen_at, served=served)
     mapping, peers = snapshots.mapping, snapshots.peers.sent
-    # Whatever a robot reports: it makes no series of interfaces that it has not announced, nor of servers that are
+    # Whatever a robot reports, it makes no series of interfaces that it has not announced, nor of servers that are
     # gone.
     carriers = dict.fromkeys(interfaces_of(sidecar)[:MAX_VIEWED], "")
     carriers |= {label.interface: label.carrier for label in sidecar.labels if label.interface in carriers}
@@ -166,7 +165,7 @@ def _served(
     if cloud.draining:
         return ()
     offered = [offer.name for offer in cloud.offers]
-    # Of what it says that it offers and lacks, one series is made.
+    # A service that it claims both to offer and to lack makes one series.
     missed = {*cloud.unmet, *cloud.withdrawn}.difference(offered)
     found = [ServedView(name, False, 0) for name in sorted(missed) if may_offer(name)]
     found += (ServedView(name, True, unanswered(name)) for name in offered if may_offer(name))
@@ -176,14 +175,16 @@ def _served(
 def _paths_of_services(
     sidecar: Sidecar, sent: tuple[ServiceMapping, ...] | None, is_offered: Callable[[ServiceName], bool], reaches: bool
 ) -> tuple[tuple[ServiceName, int], ...]:
-    """What the robot carries, as told last, if it was told; and what it wants and nobody serves: by what it says, or
-    since it carried that until no cloud that it may call offered it; or it says that it reaches none of those who serve
-    it, and `reaches` others."""
+    """Return what the robot carries, as last told, if it was told; and what it wants and nobody serves.
+
+    The latter holds if it says so, if it carried that until no cloud that it may call offered it, or if it says that it
+    reaches none of those who serve it, and `reaches` others.
+    """
     told = {mapping.service: len(mapping.assignments) for mapping in sent or ()}
     carries = [use.name for use in sidecar.uses]
     found = {name: told[name] for name in carries[:MAX_VIEWED] if name in told}
     given_up = sorted(name for name in sidecar.carried.difference(carries) if not is_offered(name))
-    # Who reaches no server at all has a trouble of its own.
+    # A robot that reaches no server at all has a trouble of its own.
     unreached = sidecar.unreached if reaches else ()
     lacks = {name: 0 for name in (*sidecar.unmet, *unreached, *given_up) if name not in found}
     return tuple(islice((found | lacks).items(), MAX_VIEWED))

@@ -1,7 +1,7 @@
-"""Who was there before the control plane was restarted, and is not back yet: nobody's lease tells of these.
+"""Awaits members from before the control plane's restart that are not back yet: no lease covers these.
 
-Whether a server was stopped in order meanwhile, only robots know. A robot may lie, to hide that a server died, so one
-alone is believed only where there is no other that could say it; and it is said by whom it is known.
+Only robots know whether a server was stopped in order meanwhile. A robot may lie, to hide that a server died. So one
+alone is believed only if no other could say it, and the operator is told by whom it is known.
 
 Times are monotonic seconds.
 """
@@ -23,43 +23,43 @@ if TYPE_CHECKING:
 TEXT = "it was there before the control plane was restarted, and did not come back"
 
 ENOUGH_WITNESSES = 2
-"""Robots that say of a server that it said goodbye, where there are as many that may call it."""
+"""Robots that must say that a server said goodbye, if as many may call it."""
 
 MAX_WITNESSES = 8
-"""Robots named; whatever further ones say is no news."""
+"""Robots named; what further ones say is no news."""
 
 
 class Returning:
-    """Awaits them, until a time."""
+    """Awaits members until a time."""
 
     def __init__(self) -> None:
         self._awaited: dict[NodeName, Departure] = {}
         self._given_up: set[NodeName] = set()
-        """Servers that did not come back in time, and of which it is not believed that they were stopped."""
+        """Servers that did not come back in time, and that are not believed to have been stopped."""
         self._witnesses: dict[NodeName, list[NodeName]] = {}
-        """Of awaited servers and those given up: robots that say that it said goodbye."""
+        """For awaited servers and those given up: robots that say that it said goodbye."""
         self.until: float | None = None
         """When to ask who is `missing`; None while nobody is awaited."""
 
     def __len__(self) -> int:
-        """How many are awaited."""
+        """Return how many are awaited."""
         return len(self._awaited)
 
     def expect(self, present: Iterable[Departure], until: float) -> None:
-        """These were there; they are noted as departures should they not come back until then."""
+        """Expect those that were present; they are noted as departures if they are not back by then."""
         self._awaited = {one.name: one for one in present}
         self._given_up.clear()
         self._witnesses.clear()
         self.until = until if self._awaited else None
 
     def is_back(self, name: NodeName) -> None:
-        """It is registered."""
+        """Note that it is registered."""
         self._awaited.pop(name, None)
         self._given_up.discard(name)
         self._witnesses.pop(name, None)
 
     def said_goodbye(self, server: NodeName, robot: NodeName) -> bool:
-        """A robot says so of a server; whether that is news of one that was given up."""
+        """Note that a robot says so of a server; return whether that is news of one that was given up."""
         awaited = self._awaited.get(server)
         if (awaited is None or awaited.role is not Role.CLOUD) and server not in self._given_up:
             return False
@@ -70,7 +70,7 @@ class Returning:
         return server in self._given_up
 
     def judged(self, gone: Departure, could_say: Callable[[NodeName], int]) -> Departure:
-        """A server's departure as it is to be noted, by what robots say of it.
+        """Return a server's departure as it is to be noted, by what robots say of it.
 
         `could_say` counts the robots that may call a server.
         """
@@ -85,7 +85,7 @@ class Returning:
         return replace(gone, text=TEXT + doubt)
 
     def missing(self, now: float, who_could_say: Callable[[], Callable[[NodeName], int]]) -> list[Departure]:
-        """Those that did not come back in time, each once; `who_could_say` returns what `judged` asks."""
+        """Return those that did not come back in time, each once; `who_could_say` returns what `judged` needs."""
         if self.until is None or self.until > now:
             return []
         could_say = who_could_say()

@@ -1,4 +1,4 @@
-"""Who is registered and how far each follows, for the operator."""
+"""Tells the operator who is registered and how far each follows."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ if TYPE_CHECKING:
 
 
 def is_met(robot: NodeName, server: NodeName, registry: Registry, permits: Permits) -> bool:
-    """Whether a server is registered and the robot may talk to it: of others it may have told what is over."""
+    """Return whether a server is registered and the robot may talk to it: what it said of others may be over."""
     cloud = registry.get(server)
     return cloud is not None and permits.may_meet(robot, cloud)
 
 
 def is_offered(robot: NodeName, service: ServiceName, registry: Registry, permits: Permits) -> bool:
-    """Whether a cloud that is registered offers a service and the robot may call it there."""
+    """Return whether a registered cloud offers a service and the robot may call it there."""
     group = permits.group(robot)
     return any(service in permits.of(group, cloud) for cloud in registry.offering(service))
 
@@ -42,7 +42,7 @@ def statuses(
     *,
     abridged: bool,
 ) -> Iterator[SidecarStatus]:
-    """Those of the sidecars of these names that are registered; `abridged`: shorter where all is in order."""
+    """Yield the status of the registered sidecars of these names; `abridged`: shorter if all is in order."""
     for name in names:
         sidecar = registry.get(name)
         if sidecar is None:
