@@ -1,1 +1,1 @@
-"""Who may call, offer and use what: access policy and path rules, applied. Imports `registry`."""
+"""Applies access policy and path rules: who may call, offer and use what. Imports `registry`."""

@@ -1,4 +1,4 @@
-"""Whom the access policy leaves nobody to talk to: to its peers, such a member is as good as gone."""
+"""Finds whom the access policy leaves nobody to talk to: to its peers, such a member is as good as gone."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ if TYPE_CHECKING:
 
 
 def cut_off(sidecars: Iterable[Sidecar], permits: Permits) -> frozenset[NodeName]:
-    """Those of the sidecars that may have to do with none of the others.
+    """Return the sidecars that may have to do with none of the others.
 
-    Nobody is cut off where there is nobody to talk to; and a cloud that has offered nothing yet is not, as nobody knows
-    yet what robots may call there.
+    Nobody is cut off if there is nobody to talk to. A cloud that has not offered anything yet is not cut off either, as
+    nobody knows yet what robots may call there.
     """
     if not permits.restricted:
         return frozenset()

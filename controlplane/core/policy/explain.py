@@ -1,4 +1,4 @@
-"""Why a call is allowed or denied, in lines for the operator."""
+"""Explains why a call is allowed or denied, in lines for the operator."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ if TYPE_CHECKING:
 
 
 MAX_CLOSE = 5
-"""Rules named that all but allow a call, the first ones."""
+"""Number of rules named that all but allow a call, the first ones."""
 
 
 @dataclass(frozen=True, slots=True)
 class Decision:
-    """What a policy says to one call."""
+    """What a policy says about one call."""
 
     allowed: bool
     reasons: tuple[str, ...]

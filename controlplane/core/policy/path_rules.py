@@ -1,7 +1,7 @@
-"""Which pairs of an interface and a cloud mappings may use, as the operator's rules have it.
+"""Decides which pairs of an interface and a cloud mappings may use, by the operator's rules.
 
-The first rule that matches a robot, one of its interfaces and a cloud decides; what none matches is allowed. This is
-about where requests should go, not about who may do what: that is the access policy's (`policy`).
+The first rule that matches a robot, one of its interfaces and a cloud decides; pairs that none matches are allowed.
+This is about where requests should go, not about who may do what: that is the access policy's (`policy`).
 """
 
 from __future__ import annotations
@@ -17,15 +17,15 @@ if TYPE_CHECKING:
     from protos.model.ids import InterfaceName, NodeName
 
 MAX_PATH_RULES = 1024
-"""Rules in the list."""
+"""Maximum number of rules in the list."""
 
 MAX_KEPT_VERDICTS = 65_536
-"""Verdicts on pairs that are kept, of some hundred bytes each; then all are worked out anew."""
+"""Verdicts on pairs that are kept, of some hundred bytes each; beyond that, all are computed again."""
 
 
 @dataclass(frozen=True, slots=True)
 class PathRule:
-    """Over these interfaces of these robots requests may go to these clouds, or may not."""
+    """Over these interfaces of these robots requests may, or may not, go to these clouds."""
 
     robots: tuple[str, ...]
     interfaces: tuple[str, ...]
@@ -44,7 +44,7 @@ class PathRules:
     def barred(
         self, robot: NodeName, interfaces: Iterable[InterfaceName], clouds: Collection[NodeName]
     ) -> frozenset[tuple[InterfaceName, NodeName]]:
-        """The pairs of these that the robot's mappings may not use."""
+        """Return which of these pairs the robot's mappings may not use."""
         about = self._robots.matching(robot) if self._rules else frozenset[int]()
         if not about:
             return frozenset()

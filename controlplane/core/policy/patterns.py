@@ -38,9 +38,10 @@ class NameKind(enum.Enum):
 
 _State = tuple[tuple[frozenset[str], int], ...]
 _STATES: dict[NameKind, tuple[tuple[_State, ...], int]] = {
-    # What `protos.model.names` lets pass, as automata: where each state leads by which characters. The last accepts.
+    # Names that `protos.model.names` accepts, as automata: where each state leads by which characters. The last
+    # accepts.
     NameKind.NODE: ((((_ALNUM, 1),), ((_ALNUM | frozenset("_.-"), 1),)), 1),
-    # Printable ASCII but for the slash.
+    # Printable ASCII except the slash.
     NameKind.INTERFACE: ((((_GRAPHIC, 1),), ((_GRAPHIC, 1),)), 1),
     NameKind.SERVICE: (
         (
@@ -59,12 +60,12 @@ def _compiled(patterns: tuple[str, ...]) -> re.Pattern[str]:
 
 
 def matches(name: str, patterns: tuple[str, ...]) -> bool:
-    """Whether one of the patterns matches the name."""
+    """Return whether one of the patterns matches the name."""
     return _compiled(patterns).match(name) is not None
 
 
 def can_match(pattern: str, kind: NameKind) -> bool:
-    """Whether any valid name matches the pattern: a walk through pattern and grammar of names side by side."""
+    """Return whether any valid name matches the pattern: walk through pattern and grammar of names side by side."""
     states, accepting = _STATES[kind]
     units = _units(pattern)
     seen: set[tuple[int, int]] = set()
@@ -91,13 +92,13 @@ def can_match(pattern: str, kind: NameKind) -> bool:
 
 
 def _units(pattern: str) -> list[str]:
-    """Cut into parts that match one character each, and stars. A bracket that is not closed is a plain character."""
+    """Cut into parts that match one character each, and stars. An unclosed bracket is a plain character."""
     units: list[str] = []
     position = 0
     while position < len(pattern):
         end = position + 1
         if pattern[position] == "[":
-            # A ']' right after the bracket, or after its '!', is one of the set.
+            # A ']' right after the bracket, or after its '!', belongs to the set.
             search = end + 1 if pattern[end : end + 1] == "!" else end
             closing = pattern.find("]", search + 1)
             if closing >= 0:
@@ -111,7 +112,7 @@ _PLAIN_BEGINNING = re.compile(r"[^*?\[]*")
 
 
 class PatternIndex:
-    """Lists of patterns by number, from 0 on."""
+    """Lists of patterns, numbered from 0."""
 
     def __init__(self, lists: Iterable[tuple[str, ...]]) -> None:
         self._plain: defaultdict[str, set[int]] = defaultdict(set)
@@ -127,7 +128,7 @@ class PatternIndex:
                     self._by_beginning[beginning[0]].append((pattern, number))
 
     def matching(self, name: str) -> frozenset[int]:
-        """The numbers of the lists of which a pattern matches the name."""
+        """Return the numbers of the lists with a pattern that matches the name."""
         found = set(self._plain.get(name, ()))
         for length in range(len(name) + 1):
             for pattern, number in self._by_beginning.get(name[:length], ()):

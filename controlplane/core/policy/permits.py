@@ -1,7 +1,7 @@
-"""The policy applied to the sidecars that are there, with what was worked out kept until the policy changes.
+"""Applies the policy to the sidecars that are present, and keeps the results until the policy changes.
 
-A publication asks for every robot and every cloud. Robots that the same rules are about form a group and may do the
-same, so that the rules are tried once for each group and cloud, not for each robot.
+A publication asks for every robot and every cloud. Robots covered by the same rules form a group and may do the same,
+so that the rules are tried once for each group and cloud, not for each robot.
 """
 
 from __future__ import annotations
@@ -18,10 +18,10 @@ if TYPE_CHECKING:
     from protos.model.ids import NodeName, ServiceName
 
 MAX_GROUPED = 2 * MAX_SIDECARS
-"""Robots whose group is kept; then all are worked out anew."""
+"""Robots whose group is kept; beyond that, all are computed again."""
 
 MAX_KEPT_PERMITS = 65_536
-"""Permits kept, of some hundred bytes each, and verdicts on offers; then all are worked out anew."""
+"""Permits kept, of some hundred bytes each, and verdicts on offers; beyond that, all are computed again."""
 
 Group = frozenset[int]
 """Indices of the `calls` rules that are about a robot."""
@@ -45,7 +45,7 @@ class Permits:
         return self._policy is not None
 
     def group(self, robot: NodeName) -> Group:
-        """The group of a robot."""
+        """Return the group of a robot."""
         if self._policy is None:
             return frozenset()
         group = self._groups.get(robot)
@@ -57,9 +57,9 @@ class Permits:
         return group
 
     def of(self, group: Group, cloud: Sidecar) -> CallPermit:
-        """What the robots of a group may call on a cloud, of all it offered since it registered.
+        """Return what the robots of a group may call on a cloud, of all it offered since it registered.
 
-        Not only of what it offers now: a server that is away for a moment must not cost its robots their place.
+        Not only its present offers count: a server that is away for a moment must not cost its robots their place.
         """
         if self._policy is None:
             return ALL_CALLS
@@ -79,21 +79,21 @@ class Permits:
         return permit
 
     def may_meet(self, robot: NodeName, cloud: Sidecar) -> bool:
-        """Whether a robot may call anything on a cloud."""
+        """Return whether a robot may call anything on a cloud."""
         return self._policy is None or bool(self.of(self.group(robot), cloud))
 
     def may_know(self, robot: NodeName, cloud: NodeName) -> bool:
-        """Whether a robot may call anything on a cloud of which no more is known than its name."""
+        """Return whether a robot may call anything on a cloud of which only the name is known."""
         return self.group_may_know(self.group(robot), cloud)
 
     def group_may_know(self, group: Group, cloud: NodeName) -> bool:
-        """The same of all robots of a group."""
+        """Return the same for all robots of a group."""
         if self._policy is None:
             return True
         return any(self._policy.calls[index].leads_to(cloud) for index in group)
 
     def may_offer(self, cloud: NodeName, service: ServiceName) -> bool:
-        """Whether a cloud may offer a service."""
+        """Return whether a cloud may offer a service."""
         if self._policy is None:
             return True
         known = self._may_offer.get((cloud, service))
@@ -106,5 +106,5 @@ class Permits:
         return known
 
     def refused_offers(self, cloud: Sidecar) -> tuple[ServiceName, ...]:
-        """What a cloud offers now and may not."""
+        """Return what a cloud offers now and may not."""
         return tuple(offer.name for offer in cloud.offers if not self.may_offer(cloud.name, offer.name))

@@ -1,8 +1,8 @@
-"""Access control: which robots may call which services on which clouds, and which clouds may offer which services.
+"""Defines access control: which robots may call which services on which clouds, and which clouds may offer them.
 
 A policy is two lists of rules of patterns (`patterns.py`). A call is allowed when some rule under `offers` lets the
 cloud offer the service, and some rule under `calls` lets the robot call the service on that cloud. What no rule allows
-is denied; there are no rules that deny. Where no policy is given at all, everything is allowed (`access.py`).
+is denied; there are no rules that deny. Without any policy, everything is allowed (`permits.py`).
 """
 
 from __future__ import annotations
@@ -19,10 +19,10 @@ if TYPE_CHECKING:
     from protos.model.ids import NodeName, ServiceName
 
 MAX_RULES = 1024
-"""Rules in one list."""
+"""Maximum number of rules in one list."""
 
 MAX_PATTERNS = 1024
-"""Patterns in one list of one rule."""
+"""Maximum number of patterns in one list of one rule."""
 
 _FINGERPRINT_BYTES = 8
 
@@ -36,19 +36,19 @@ class CallRule:
     clouds: tuple[str, ...]
 
     def __str__(self) -> str:
-        """As the configuration has it."""
+        """Return it as written in the configuration."""
         return f"{{robots: {_listed(self.robots)}, services: {_listed(self.services)}, clouds: {_listed(self.clouds)}}}"
 
     def concerns(self, robot: NodeName) -> bool:
-        """Whether the rule is about this robot."""
+        """Return whether the rule is about this robot."""
         return matches(robot, self.robots)
 
     def lets_call(self, service: ServiceName, cloud: NodeName) -> bool:
-        """Whether the rule lets the robots it is about call the service on the cloud."""
+        """Return whether the rule lets the robots it is about call the service on the cloud."""
         return self.leads_to(cloud) and matches(service, self.services)
 
     def leads_to(self, cloud: NodeName) -> bool:
-        """Whether the rule lets the robots it is about call anything there."""
+        """Return whether the rule lets the robots it is about call anything there."""
         return matches(cloud, self.clouds)
 
 
@@ -60,11 +60,11 @@ class OfferRule:
     services: tuple[str, ...]
 
     def __str__(self) -> str:
-        """As the configuration has it."""
+        """Return it as written in the configuration."""
         return f"{{clouds: {_listed(self.clouds)}, services: {_listed(self.services)}}}"
 
     def lets_offer(self, cloud: NodeName, service: ServiceName) -> bool:
-        """Whether the rule lets the cloud offer the service."""
+        """Return whether the rule lets the cloud offer the service."""
         return matches(cloud, self.clouds) and matches(service, self.services)
 
 
@@ -76,23 +76,24 @@ class Policy:
     offers: tuple[OfferRule, ...] = ()
 
     def offer_rule(self, cloud: NodeName, service: ServiceName) -> int | None:
-        """Index of the first rule that lets the cloud offer the service."""
+        """Return the index of the first rule that lets the cloud offer the service."""
         return next((index for index, rule in enumerate(self.offers) if rule.lets_offer(cloud, service)), None)
 
     def call_rule(self, robot: NodeName, service: ServiceName, cloud: NodeName) -> int | None:
-        """Index of the first rule that lets the robot call the service on the cloud, may that offer it or not."""
+        """Return the index of the first rule that lets the robot call the service on the cloud, may that offer it or
+        not."""
         for index, rule in enumerate(self.calls):
             if rule.lets_call(service, cloud) and rule.concerns(robot):
                 return index
         return None
 
     def allows(self, robot: NodeName, service: ServiceName, cloud: NodeName) -> bool:
-        """Whether the robot may call the service on the cloud."""
+        """Return whether the robot may call the service on the cloud."""
         return self.offer_rule(cloud, service) is not None and self.call_rule(robot, service, cloud) is not None
 
     @property
     def fingerprint(self) -> int:
-        """64 bits that differ between policies, and from what stands in their place where there is none."""
+        """64 bits that differ between policies, and from the value that stands for no policy."""
         text = json.dumps(
             [
                 [[rule.robots, rule.services, rule.clouds] for rule in self.calls],
@@ -104,5 +105,5 @@ class Policy:
 
 
 def _listed(patterns: tuple[str, ...]) -> str:
-    """A YAML list; quoted, since a star at the beginning means something else there."""
+    """Return a YAML list; quoted, since a star at the beginning means something else there."""
     return json.dumps(patterns)

@@ -1,4 +1,4 @@
-"""Which refused offers are known already: each is counted and told once while its cloud is registered."""
+"""Remembers which refused offers are known: each is counted and reported once while its cloud is registered."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ if TYPE_CHECKING:
     from protos.model.ids import NodeName, ServiceName
 
 MAX_TOLD = 1024
-"""Services of one cloud that are told of: as many as it may offer at once. Further ones are counted only."""
+"""Services of one cloud that are reported: as many as it may offer at once. Further ones are only counted."""
 
 
 class RefusedOffers:
@@ -18,7 +18,7 @@ class RefusedOffers:
         self._told: dict[NodeName, set[ServiceName]] = {}
 
     def update(self, cloud: NodeName, refused: tuple[ServiceName, ...]) -> tuple[int, tuple[ServiceName, ...]]:
-        """What a cloud offers and may not, all of it; returns how many are new, and those to tell of."""
+        """Take all that a cloud offers and may not; return how many are new, and those to report."""
         told = self._told.get(cloud, set())
         new = [service for service in refused if service not in told]
         untold = tuple(new[: MAX_TOLD - len(told)])
@@ -27,9 +27,9 @@ class RefusedOffers:
         return len(new), untold
 
     def forget(self, cloud: NodeName) -> None:
-        """The cloud is not registered any more."""
+        """Note that the cloud is no longer registered."""
         self._told.pop(cloud, None)
 
     def clear(self) -> None:
-        """The policy changed: all is told anew."""
+        """Forget everything, as the policy changed: all is reported again."""
         self._told.clear()

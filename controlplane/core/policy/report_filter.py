@@ -1,4 +1,4 @@
-"""Of a robot's report what is about pairs and services that it may use: nobody bears witness to anything else."""
+"""Filters a robot's report for pairs and services that it may use: nobody bears witness to anything else."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 
 def believable(report: Report, robot: NodeName, registry: Registry, permits: Permits) -> tuple[Report, int]:
-    """Return what is left of a report, and how many of its entries are not."""
+    """Return what remains of a report, and how many of its entries were removed."""
     group = permits.group(robot)
     known: dict[NodeName, tuple[CallPermit | None, frozenset[ServiceName]]] = {}
 
