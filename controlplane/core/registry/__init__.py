@@ -1,4 +1,4 @@
-"""Who is there: registrations, leases, and whether they agree with their certificates.
+"""Keeps who is present: registrations, leases, and whether they agree with their certificates.
 
 Imports `base` and `overload`.
 """

@@ -1,4 +1,4 @@
-"""Whether what a registration says of the sidecar is what its certificate says. Pure functions."""
+"""Checks whether a registration says of the sidecar what its certificate says. Pure functions."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 
 def check_claims(registration: Registration, identity: Identity, certificate: bytes) -> Refusal | None:
-    """Return why the registration is not what the holder of this certificate (DER) may say, or None."""
+    """Return why the holder of this certificate (DER) may not claim this registration, or None."""
     if registration.name != identity.name:
         return Refusal.NAME_MISMATCH
     if registration.role.value != identity.role.value:
@@ -25,14 +25,14 @@ def check_claims(registration: Registration, identity: Identity, certificate: by
 
 
 def check_unproven_claims(registration: Registration) -> Refusal | None:
-    """The same where nobody has certificates: the credential, if any, has at least to agree with the registration."""
+    """Do the same where nobody has certificates: a credential, if any, must at least agree with the registration."""
     if registration.credential and not _is_own(registration):
         return Refusal.BAD_CREDENTIAL
     return None
 
 
 def _is_own(registration: Registration, certificate: bytes = b"", identity: Identity | None = None) -> bool:
-    """The peers check it themselves; here it is about a clear answer to a sidecar that presents another's."""
+    """Return whether the credential is its own: peers check it too; this gives a clear answer to one with another's."""
     try:
         credential = decode_credential(registration.credential)
         said = (credential.name, credential.role, credential.session, credential.incarnation, credential.certificate)

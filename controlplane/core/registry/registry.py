@@ -1,7 +1,7 @@
-"""Who is there: registrations with leases, without IO.
+"""Keeps who is present: registrations with leases, without IO.
 
-A sidecar is known by its name from its registration until its lease ends or it says goodbye. Losing the stream
-alone does not remove it: a robot in a tunnel is still there.
+A sidecar is known by its name from its registration until its lease ends or it says goodbye. Losing the stream alone
+does not remove it: a robot in a tunnel is still there.
 """
 
 from __future__ import annotations
@@ -27,25 +27,25 @@ StreamId = NewType("StreamId", int)
 """Number of one stream, unique in one run of the control plane."""
 
 MAX_SIDECARS = 4096
-"""Sidecars known at once: as many as one set of peers holds. One more is refused, not let in for another."""
+"""Sidecars known at once: as many as one set of peers holds. A further one is refused, not let in for another."""
 
 MAX_OFFERED = 1024
-"""Names of services remembered for one cloud: as many as it may offer at once. More: only what it offers now."""
+"""Service names remembered for one cloud, as many as it may offer at once. Beyond that, only its present offers."""
 
 MAX_REMEMBERED_REMOVALS = 4096
-"""Reasons of removals kept for notices; beyond that the oldest goes, and its notice says "lease expired"."""
+"""Reasons of removals kept for notices; beyond that the oldest is evicted, and its notice says "lease expired"."""
 
 
 _PEER_BYTES, _CANDIDATE_BYTES, _OFFER_BYTES = 80, 24, 16
-"""What a peer, an address and an offer take in a message beside their names."""
+"""Size of a peer, an address and an offer in a message, besides their names."""
 
 POSTPONE_S = 1.0
-"""From one judgement of a lease to the next, for a member whose bytes have arrived and are not read yet: a second's
-messages of a fleet are read meanwhile."""
+"""Time from one judgement of a lease to the next, for a member whose bytes have arrived but are not read yet: a
+second's messages of a fleet are read meanwhile."""
 
 MAX_POSTPONED = 4
-"""Judgements put off for one silence: bytes are not words. Who says nothing while its kernel or gRPC still answers
-loses its lease so many seconds later."""
+"""Judgements postponed for one silence: bytes are not words. A member that says nothing while its kernel or gRPC still
+answers loses its lease this many seconds later."""
 
 
 class Refusal(enum.Enum):
@@ -66,11 +66,11 @@ class Refusal(enum.Enum):
 
 @dataclass(frozen=True, slots=True)
 class Admission:
-    """A registration was accepted; `replaced` is the stream that has to end for it."""
+    """An accepted registration; `replaced` is the stream that has to end for it."""
 
     replaced: StreamId | None
     new_run: bool
-    """The sidecar is new, or was started anew; not merely connected again."""
+    """Whether the sidecar is new, or was restarted; not merely connected again."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,9 +80,9 @@ class Sidecar:
     registration: Registration
     stream: StreamId | None
     candidates: tuple[Candidate, ...] | None = None
-    """None until told."""
+    """None until announced."""
     services: ServiceSet | None = None
-    """None until told."""
+    """None until announced."""
     draining: bool = False
     offered: frozenset[ServiceName] = frozenset()
     """Services it has offered since it registered, at most MAX_OFFERED."""
@@ -97,7 +97,7 @@ class Sidecar:
     signed_under: bytes = field(default=b"", repr=False)
     """The credential in whose session, and with whose certificate, the candidates were signed."""
     revocations: RevocationSet = NO_REVOCATIONS
-    """Which lists it uses."""
+    """Which revocation lists it uses."""
 
     @property
     def name(self) -> NodeName:
@@ -111,7 +111,7 @@ class Sidecar:
 
     @property
     def ready(self) -> bool:
-        """Whether it told its addresses and services; before, its peers would learn nothing of use."""
+        """Whether it announced its addresses and services; before that, its peers would learn nothing useful."""
         return self.candidates is not None and self.services is not None
 
     @property
@@ -131,7 +131,7 @@ class Sidecar:
 
     @property
     def unreached(self) -> tuple[ServiceName, ...]:
-        """Services that its configuration names and servers offer that it knows of, none of which it reaches."""
+        """Services that its configuration names and known servers offer, none of which it reaches."""
         return self.services.unreached if self.services is not None else ()
 
     @property
@@ -141,11 +141,11 @@ class Sidecar:
 
     @property
     def withdrawn(self) -> frozenset[ServiceName]:
-        """Services that it offered since it registered, and does not now."""
+        """Services that it offered since it registered, but not now."""
         return self.offered.difference(offer.name for offer in self.offers)
 
     def having_said(self, told: CandidateSet | ServiceSet) -> Sidecar:
-        """The same with other addresses, and what it says of its interfaces, or with other services."""
+        """Return the same with other addresses and statements about its interfaces, or with other services."""
         if isinstance(told, CandidateSet):
             return replace(
                 self,
@@ -169,7 +169,7 @@ class Sidecar:
 
     @property
     def told_bytes(self) -> int:
-        """How much its peers are told whenever anything that they are told of it changes, roughly."""
+        """Rough size of what its peers are told whenever any of that changes."""
         if not self.ready:
             return 0
         size = _PEER_BYTES + len(self.registration.credential) + len(self.candidates_signature)
@@ -177,9 +177,9 @@ class Sidecar:
         return size + sum(_OFFER_BYTES + len(offer.name) + len(offer.type) for offer in self.offers)
 
     def as_peer(self) -> Peer:
-        """What its peers are told of it, but with its own token; each is told the one made for it (`ToldPeers`)."""
-        # A signature of the run before, or of the certificate before, is none under this credential: they say it anew
-        # in a moment, and until then each peer goes on with what it has.
+        """Return what its peers are told of it, with its own token; each is told the one made for it (`ToldPeers`)."""
+        # A signature of the previous run or certificate is invalid under this credential: the sidecar announces again
+        # in a moment, and until then each peer continues with what it has.
         stale = bool(self.candidates_signature) and self.signed_under != self.registration.credential
         return Peer(
             name=self.registration.name,
@@ -197,12 +197,12 @@ class Sidecar:
 
 
 DEPARTURES = (RemovalReason.LEASE_EXPIRED, RemovalReason.LEFT, RemovalReason.REVOKED, RemovalReason.EXPIRED)
-"""Why one leaves the registry, and so every view."""
+"""Why a sidecar leaves the registry, and so every view."""
 
 
 @dataclass(slots=True)
 class RegistryCounters:
-    """What happened, for the metrics."""
+    """Counts what happened, for the metrics."""
 
     refused: dict[Refusal, int] = field(default_factory=lambda: dict.fromkeys(Refusal, 0))
     departed: dict[RemovalReason, int] = field(default_factory=lambda: dict.fromkeys(DEPARTURES, 0))
@@ -211,13 +211,13 @@ class RegistryCounters:
 
 @dataclass(slots=True)
 class _Lease:
-    """Apart from the sidecar, which is replaced when it changes: this changes with each message."""
+    """Kept apart from the sidecar, which is replaced when it changes: this changes with each message."""
 
     length_s: float
     end: float
     heard_at: float
     postponed: int = 0
-    """Times since it was heard."""
+    """Times postponed since it was last heard."""
 
 
 class Registry:
@@ -225,16 +225,16 @@ class Registry:
 
     def __init__(self, *, lease_s: float) -> None:
         self.lease_s = lease_s
-        """Of those that register, or are told anew, from now on."""
+        """Lease of sidecars that register, or are told again, from now on."""
         self._leases: dict[NodeName, _Lease] = {}
         self._sidecars: dict[NodeName, Sidecar] = {}
         self._sessions: dict[SessionId, NodeName] = {}
         self._shares = RegistrationShare()
         self._offering: dict[ServiceName, set[NodeName]] = {}
-        """The clouds that offer each."""
+        """The clouds that offer each service."""
         self._removals: OrderedDict[NodeName, tuple[RemovalReason, float]] = OrderedDict()
-        """Why, and when each was heard last."""
-        # One entry a name, at most as late as its lease ends: renewing a lease does not touch it.
+        """Why each was removed, and when it was last heard."""
+        # One entry per name, at the end of its lease at the latest: renewing a lease does not touch it.
         self._ends: list[tuple[float, NodeName]] = []
         self._awaited: set[NodeName] = set()
         self.postponed = Postponed()
@@ -247,14 +247,14 @@ class Registry:
         return len(self._sidecars)
 
     def get(self, name: NodeName) -> Sidecar | None:
-        """The sidecar of that name."""
+        """Return the sidecar of that name."""
         return self._sidecars.get(name)
 
     def register(self, registration: Registration, stream: StreamId, now: float) -> Admission | Refusal:
         """Let a sidecar in, or say why not.
 
-        A name belongs to the token that took it first for as long as its lease lasts, and within a token to the
-        newest incarnation; the same run that connects again replaces its own older stream.
+        A name belongs to the token that took it first for as long as its lease lasts, and within a token to the newest
+        incarnation; the same run that connects again replaces its own older stream.
         """
         name = registration.name
         if self._sessions.get(registration.session, name) != name:
@@ -281,7 +281,7 @@ class Registry:
             return self._refuse(Refusal.NAME_TAKEN)
         if not self._shares.take(name, now, new_run=_tells_anything(registration, before)):
             return self._refuse(Refusal.TOO_OFTEN)
-        # What it said last holds until it says it anew, a moment from now: its peers see no gap.
+        # What it last announced holds until it announces again, a moment from now: its peers see no gap.
         carried = known.carried if same_run else frozenset()
         self._sidecars[name] = replace(known, registration=registration, stream=stream, draining=False, carried=carried)
         del self._sessions[before.session]
@@ -290,7 +290,7 @@ class Registry:
         return Admission(replaced=known.stream, new_run=not same_run)
 
     def remove(self, name: NodeName, reason: RemovalReason) -> Sidecar | None:
-        """Remove it, whatever its lease; returns it as it was, or None if it was not there."""
+        """Remove it, whatever its lease; return it as it was, or None if it was not there."""
         known = self._sidecars.get(name)
         if known is not None:
             self._remove(name, reason)
@@ -301,19 +301,20 @@ class Registry:
         return refusal
 
     def lease_end(self, name: NodeName) -> float:
-        """When a registered sidecar's lease ends unless it speaks."""
+        """Return when a registered sidecar's lease ends unless it speaks."""
         return self._leases[name].end
 
     def told_lease_s(self, name: NodeName) -> float:
-        """How long a registered sidecar was told that it may be silent."""
+        """Return how long a registered sidecar was told that it may be silent."""
         return self._leases[name].length_s
 
     def tell_lease(self, name: NodeName) -> None:
-        """A registered sidecar is told of the lease of now. Its present one goes on, as it may learn of that late."""
+        """Note that a registered sidecar is told the present lease. Its own one goes on, as it may learn of that
+        late."""
         self._leases[name].length_s = self.lease_s
 
     def touch(self, name: NodeName, stream: StreamId, now: float) -> bool:
-        """Renew the lease because `stream` spoke; False if it is not the sidecar's stream any more."""
+        """Renew the lease because `stream` spoke; return False if it is no longer the sidecar's stream."""
         if not self._is_current(name, stream):
             return False
         lease = self._leases[name]
@@ -327,14 +328,14 @@ class Registry:
         return known is not None and known.stream == stream
 
     def set_candidates(self, name: NodeName, told: CandidateSet) -> bool:
-        """Replace its addresses and what it says of its interfaces; True if they changed for others: which ones carry
-        nothing is the operator's business."""
+        """Replace its addresses and what it says of its interfaces; return True if they changed for others: which ones
+        carry nothing is the operator's business."""
         known = self._sidecars[name]
         changed = self._sidecars[name] = known.having_said(told)
         return changed != replace(known, down=told.down)
 
     def set_services(self, name: NodeName, services: ServiceSet) -> bool:
-        """Replace its services; True if they changed for others: which ones are unmet is the operator's business."""
+        """Replace its services; return True if they changed for others: unmet ones are the operator's business."""
         known = self._sidecars[name]
         before = known.services
         self._offers_no_more(known)
@@ -345,7 +346,7 @@ class Registry:
         return before is None or (services.offers, services.uses) != (before.offers, before.uses)
 
     def unsay(self, name: NodeName) -> None:
-        """What it has said of its addresses and services does not hold any more, until it says it anew."""
+        """Withdraw what it has announced of its addresses and services, until it announces again."""
         known = self._sidecars[name]
         self._offers_no_more(known)
         self._sidecars[name] = replace(known, candidates=None, services=None)
@@ -360,11 +361,11 @@ class Registry:
 
     @property
     def shares_forgotten(self) -> int:
-        """Members whose shares of what the registry counts began afresh for want of room."""
+        """Members whose shares of what the registry counts were reset for lack of room."""
         return self._shares.shares.forgotten + self.postponed.shares.forgotten
 
     def offering(self, service: ServiceName) -> Iterator[Sidecar]:
-        """The registered clouds that offer it, whether or not they may."""
+        """Return the registered clouds that offer it, whether or not they may."""
         return (self._sidecars[name] for name in self._offering.get(service, ()))
 
     def set_revocations(self, name: NodeName, held: RevocationSet) -> None:
@@ -372,15 +373,15 @@ class Registry:
         self._sidecars[name] = replace(self._sidecars[name], revocations=held)
 
     def set_draining(self, name: NodeName) -> bool:
-        """It is about to go; True if that is news."""
+        """Note that it is about to leave; return True if that is news."""
         known = self._sidecars[name]
         self._sidecars[name] = replace(known, draining=True)
         return not known.draining
 
     def disconnect(self, name: NodeName, stream: StreamId) -> RemovalReason | None:
-        """Its stream ended: who was draining has left, others stay until their lease ends.
+        """Note that its stream ended: a draining sidecar has left, others stay until their lease ends.
 
-        Returns the reason if it was removed.
+        Return the reason if it was removed.
         """
         if not self._is_current(name, stream):
             return None
@@ -397,11 +398,11 @@ class Registry:
             heapq.heappush(self._ends, (self._leases[name].end, name))
 
     def next_expiry(self) -> float | None:
-        """When to call `expire` next; it may then find that the lease was renewed."""
+        """Return when to call `expire` next; it may then find that the lease was renewed."""
         return self._ends[0][0] if self._ends else None
 
     def due(self, now: float) -> list[NodeName]:
-        """Those whose lease ended, and whom `expire` would remove now unless there is something of them to read."""
+        """Return those whose lease ended, whom `expire` would remove now unless something of theirs is left to read."""
         found = self._take_due(now)
         for name in found:
             self._await_end(name)
@@ -424,7 +425,7 @@ class Registry:
     def expire(self, now: float, unread: Collection[NodeName] = ()) -> list[Sidecar]:
         """Remove those whose lease ended, and return them as they were.
 
-        Of those in `unread` bytes have arrived after what was read last. They are judged a little later, some times.
+        For those in `unread`, bytes have arrived after what was last read. They are judged a little later, some times.
         """
         gone: list[Sidecar] = []
         for name in self._take_due(now):
@@ -452,12 +453,12 @@ class Registry:
             self.counters.removals_forgotten += 1
 
     def removal_reason(self, name: NodeName) -> RemovalReason:
-        """Why that sidecar is not there; "lease expired" of one never known or forgotten, the careful guess."""
+        """Return why that sidecar is gone; the careful guess for one never known or forgotten is "lease expired"."""
         removed = self._removals.get(name)
         return RemovalReason.LEASE_EXPIRED if removed is None else removed[0]
 
     def heard_at(self, name: NodeName, now: float) -> float:
-        """When a sidecar, registered or gone, said something last; `now` of one never known or forgotten."""
+        """Return when a sidecar, registered or gone, last said something; `now` for one never known or forgotten."""
         lease = self._leases.get(name)
         if lease is not None:
             return lease.heard_at
@@ -466,6 +467,6 @@ class Registry:
 
 
 def _tells_anything(registration: Registration, before: Registration) -> bool:
-    """Whether all others are to be told of what a sidecar registers with; not of what it holds itself."""
+    """Return whether all others are to be told of what a sidecar registers with, apart from what it holds itself."""
     held = replace(before, peers_version=registration.peers_version, mapping_version=registration.mapping_version)
     return registration != held

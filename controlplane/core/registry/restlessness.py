@@ -1,7 +1,7 @@
-"""Members that change what they announce all the time: every change is told to all others, so each has its share.
+"""Limits members that change what they announce all the time: every change is told to all others.
 
-A change within the share counts at once. One beyond it waits, and only the last of its kind does. With each change all
-that others know of the member is told again: if that is much, it has a share of bytes, too.
+So each member has its share. A change within it counts at once. One beyond it waits, and only the last of its kind
+does. Each change repeats all that others know of the member: if that is much, it has a share of bytes, too.
 """
 
 from __future__ import annotations
@@ -22,27 +22,27 @@ if TYPE_CHECKING:
     Announcement = CandidateSet | ServiceSet
 
 CHANGES_BURST = 30.0
-"""A start and some minutes of interfaces that come and go."""
+"""Covers a start and some minutes of interfaces that come and go."""
 
 CHANGES_PER_S = 0.2
-"""After that: everybody is told of all peers with each, some 20 kB in a fleet of 20 servers."""
+"""Rate after that: with each change everybody receives all peers, some 20 kB in a fleet of 20 servers."""
 
 LIGHT_BYTES = 5000
-"""What is told in so few bytes waits for no share of bytes: that of changes keeps it to 1 kB a second."""
+"""Announcements up to this size need no share of bytes: the share of changes limits them to 1 kB a second."""
 
 BYTES_BURST = 1_000_000.0
-"""Bytes told of one member at once, to each who is told of it: those of a server whose 150 services come up one by one,
-the last ones with 10 kB each."""
+"""Bytes told of one member at once, to each listener: those of a server whose 150 services come up one by one, the last
+ones with 10 kB each."""
 
 BYTES_PER_S = 1000.0
-"""After that: what a robot's control stream takes anyway, on a link that is billed."""
+"""Rate after that: what a robot's control stream takes anyway, on a link that is billed."""
 
 
 @dataclass(slots=True)
 class _Share:
     changes: TokenBucket
     told_bytes: float
-    """Told, and not paid for by time yet."""
+    """Told, and not yet paid for by time."""
     at: float
 
     @classmethod
@@ -50,7 +50,7 @@ class _Share:
         return cls(TokenBucket(rate=CHANGES_PER_S, burst=CHANGES_BURST, now=now), 0.0, now)
 
     def is_spent(self, now: float) -> bool:
-        """Whether no more than light changes are told of this member for a while."""
+        """Return whether only light changes are told of this member for a while."""
         self._pass(now)
         return self.told_bytes > BYTES_BURST
 
@@ -74,13 +74,13 @@ class Restlessness:
         """Changes that had to wait."""
 
     def next_time(self) -> float | None:
-        """When to look for what has `due`; None while nothing waits."""
+        """Return when to look for what is `due`; None while nothing waits."""
         return self._look_at
 
     def admits(self, name: NodeName, stream: StreamId, told: Announcement, size: int, now: float) -> bool:
-        """Whether this counts now; else it waits, in place of what waited before.
+        """Return whether this counts now; otherwise it waits, in place of what waited before.
 
-        `size`: the bytes that each other one is told then.
+        `size` is the number of bytes that each other member is told then.
         """
         waiting_stream, waiting = self._waiting.get(name, (stream, {}))
         if waiting_stream == stream and waiting:
@@ -97,25 +97,25 @@ class Restlessness:
         return False
 
     def take(self, name: NodeName, now: float) -> bool:
-        """Count a change of this member; False if that is more than its share."""
+        """Count a change of this member; return False if that exceeds its share."""
         return self.shares.of(name, now).changes.take(now)
 
     def may_tell(self, name: NodeName, size: int, now: float) -> bool:
-        """Whether so many bytes are within this member's share."""
+        """Return whether this many bytes are within this member's share."""
         return size <= LIGHT_BYTES or not self.shares.of(name, now).is_spent(now)
 
     def tell(self, name: NodeName, size: int, now: float) -> None:
-        """So many bytes are told of this member, whether or not it may."""
+        """Count this many bytes told of this member, whether or not it may."""
         self.shares.of(name, now).tell(size, now)
 
     def forget(self, name: NodeName) -> None:
-        """A stream of this member begins or ends: it says anew what it has to say. Its share stays what it is."""
+        """Note that a stream of this member begins or ends: it announces everything again. Its share stays as it is."""
         self._waiting.pop(name, None)
 
     def due(
         self, now: float, size_of: Callable[[NodeName, Collection[Announcement]], int]
     ) -> list[tuple[NodeName, StreamId, list[Announcement]]]:
-        """What has waited for long enough; `size_of` tells how many bytes each other one is told then."""
+        """Return what has waited long enough; `size_of` tells how many bytes each other member is told then."""
         if self._look_at is None or self._look_at > now:
             return []
         found = []
