@@ -1,1 +1,1 @@
-"""How the control plane stays alive when much is asked of it: admission, pacing, shares. Imports `base`."""
+"""Keeps the control plane alive when much is asked of it: admission, pacing, shares. Imports `base`."""

@@ -1,13 +1,13 @@
-"""Who is let in next, and when: a narrow gate with a waiting line that overload cannot make useless. Sans-IO.
+"""Decides who is let in next, and when: a narrow gate with a waiting line that overload cannot make useless. Sans-IO.
 
-A line that is served oldest first works, once it is longer than its clients' patience, for clients that have just given
-up: nobody gets in although the server is busy, and that lasts (a metastable failure). So here the newest of a source is
-served first: who is served has waited least, and is still there. The sources are served in turn, so that one that sends
-more than all others together keeps none of them out.
+A line served oldest first works, once it is longer than its clients' patience, for clients that have just given up:
+nobody gets in although the server is busy, and that lasts (a metastable failure). So the newest item of a source is
+served first: it has waited least, and is still there. The sources are served in turn, so that one that sends more than
+all others together keeps none of them out.
 
-Only so many are on their way at once between their turn and their registration: what is begun is ended before more is
-begun. A stranger who stops in the middle counts for as long as a healthy network takes; one who has proven to be a
-member counts for longer, since it is most likely we who have not come to it yet, but each member only once.
+Only a limited number are on their way at once between their turn and their registration: what is begun is ended before
+more is begun. A stranger that stops in the middle counts for as long as a healthy network takes. A proven member counts
+for longer, since most likely it is we who have not come to it yet, but each member only once.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ class Admission(Generic[T]):
     """Decides for items that wait, each with its source; `now` is monotonic seconds. No call takes longer for many.
 
     Args:
-        most_waiting: items in the line; of more, the source that has most of them loses its oldest.
+        most_waiting: items in the line; beyond that, the source with most of them loses its oldest.
         most_on_the_way: items that have had their turn and are not over.
         stranger_s: for how long one counts as such.
         member_s: the same from the proof of being a member.
@@ -51,23 +51,23 @@ class Admission(Generic[T]):
         self._stranger_s = stranger_s
         self._member_s = member_s
         self._waiting: dict[T, str] = {}
-        """All in the line, with their sources."""
+        """All items in the line, with their sources."""
         self._sources: OrderedDict[str, OrderedDict[T, None]] = OrderedDict()
         """The line of each source, oldest first; the source whose turn it is comes first."""
         self._by_length: dict[int, dict[str, None]] = {}
         """The sources by the length of their lines."""
         self._longest = 0
         self._strangers: OrderedDict[T, float] = OrderedDict()
-        """On the way and not proven yet; since when, oldest first."""
+        """Items on the way and not proven yet; since when, oldest first."""
         self._members: OrderedDict[str, tuple[T, float]] = OrderedDict()
-        """On the way, by the names that are proven; since when, oldest first."""
+        """Items on the way, by their proven names; since when, oldest first."""
 
     def __len__(self) -> int:
         """Return how many wait."""
         return len(self._waiting)
 
     def wait(self, item: T, source: str) -> T | None:
-        """One more waits; returns who has to go for it, if there is no room. It may be the same one."""
+        """Add one to the line; return which one has to leave for it, if there is no room. It may be the same one."""
         self._waiting[item] = source
         line = self._sources.setdefault(source, OrderedDict())
         line[item] = None
@@ -79,7 +79,7 @@ class Admission(Generic[T]):
         return victim
 
     def leave(self, item: T) -> None:
-        """It does not wait any more; without effect if it does not."""
+        """Remove it from the line; without effect if it does not wait."""
         source = self._waiting.pop(item, None)
         if source is None:
             return
@@ -90,7 +90,7 @@ class Admission(Generic[T]):
             del self._sources[source]
 
     def next(self, now: float) -> T | None:
-        """Return whose turn it is, who is on the way from now on; None if nobody waits or too many are on the way."""
+        """Return whose turn it is, now on the way; None if nobody waits or too many are on the way."""
         self._forget_stuck(now)
         if not self._sources or self.on_the_way >= self._most_on_the_way:
             return None
@@ -107,20 +107,20 @@ class Admission(Generic[T]):
         return len(self._strangers) + len(self._members)
 
     def proven(self, item: T, name: str, now: float) -> None:
-        """It is this member, on its way yet; whoever was under the same name does not count any more."""
+        """Note that it is this member, still on its way; an earlier one under the same name no longer counts."""
         self._strangers.pop(item, None)
         self._members.pop(name, None)
         self._members[name] = item, now
 
     def over(self, item: T, name: str | None = None) -> bool:
-        """It has come through, or never will; `name` if it is proven. Returns whether there is more room now."""
+        """Note that it has come through, or never will; `name` if it is proven. Return whether there is more room."""
         if name is not None and name in self._members and self._members[name][0] == item:
             del self._members[name]
             return True
         return self._strangers.pop(item, None) is not None
 
     def next_at(self) -> float | None:
-        """When to ask for the next one at the latest, although nobody was over; None if nobody waits."""
+        """Return when to ask for the next one at the latest, even if nobody was over; None if nobody waits."""
         if not self._waiting:
             return None
         if self.on_the_way < self._most_on_the_way:
@@ -143,6 +143,6 @@ class Admission(Generic[T]):
                 del self._by_length[before]
         if after:
             self._by_length.setdefault(after, {})[source] = None
-        # By one up or down at a time: the longest line is found in one step.
+        # Lengths change by one at a time, so the longest line is found in one step.
         if after > self._longest or (before == self._longest and before not in self._by_length):
             self._longest = after

@@ -1,6 +1,6 @@
-"""Members that have something logged all the time: each has its share of lines, so that none fills the disk.
+"""Limits members that cause log lines all the time: each has its share, so that none fills the disk.
 
-What happened is in the log of events too, which is bounded as a whole, and in the metrics.
+What happened is also in the log of events, which is bounded as a whole, and in the metrics.
 """
 
 from __future__ import annotations
@@ -14,14 +14,14 @@ LINES_BURST = 20.0
 """A day of somebody who looks for a mistake, in minutes."""
 
 LINES_PER_S = 1.0 / 60.0
-"""After that: 150 kB a day."""
+"""Rate after that: 150 kB a day."""
 
 
 @dataclass(slots=True)
 class _Lines:
     share: TokenBucket
     left_out: int = 0
-    """Since the last line on the member."""
+    """Lines left out since the last line on the member."""
 
 
 class LineShare:
@@ -30,12 +30,13 @@ class LineShare:
     def __init__(self) -> None:
         self.shares = MemberTable(lambda now: _Lines(TokenBucket(rate=LINES_PER_S, burst=LINES_BURST, now=now)))
         self.left_out = 0
-        """Of all members."""
+        """Lines left out, of all members."""
 
     def take(self, member: str, now: float, of_all: TokenBucket | None = None) -> int | None:
-        """How many lines on this member were left out since its last one; None: this one is to be left out too.
+        """Return how many lines on this member were left out since its last one; None: leave out this one too.
 
-        `of_all`: a share of all members together, in lines of some kind; one beyond its own share takes nothing of it.
+        `of_all` is a share of all members together, in lines of some kind; a line beyond its own share takes nothing of
+        it.
         """
         lines = self.shares.of(member, now)
         if lines.share.take(now) and (of_all is None or of_all.take(now)):

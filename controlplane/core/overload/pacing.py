@@ -1,9 +1,9 @@
-"""How often sidecars report and how long their leases last: by how many they are, and how busy the control plane is.
+"""Sets how often sidecars report and how long their leases last, by their number and how busy the control plane is.
 
 A report costs the same in a fleet of ten as in one of ten thousand. So its interval grows with about the square root of
 the number: ten sidecars report at the configured interval, a thousand at 12.6 times it, and together they send eight
-times as much instead of a hundred. What cannot wait is reported at once whatever the interval (`ControlSession`). A
-control plane that is busy all the same stretches the interval further.
+times as much instead of a hundred. Urgent news is reported at once whatever the interval (`ControlSession`). A control
+plane that is busy all the same stretches the interval further.
 """
 
 from __future__ import annotations
@@ -11,22 +11,22 @@ from __future__ import annotations
 import math
 
 FULL_PACE = 10
-"""So many sidecars report at the configured interval."""
+"""Up to this number, sidecars report at the configured interval."""
 
 GROWTH = 0.55
-"""The power of their number by which it grows: 1,000 sidecars, at 6.3 s instead of 0.5, take a quarter of a core."""
+"""Exponent of their number by which it grows: 1,000 sidecars, at 6.3 s instead of 0.5, take a quarter of a core."""
 
 MAX_INTERVAL_S = 10.0
-"""The most that pacing makes of a shorter interval: histograms fade with a minute's half-life."""
+"""Maximum to which pacing lengthens a shorter interval: histograms fade with a minute's half-life."""
 
 REPORTS_PER_LEASE = 3.0
 """A lease outlasts two lost reports; heartbeats, a third of a lease apart, then cost nothing beside reports."""
 
 BUSY, IDLE = 0.6, 0.3
-"""Shares of one core above which intervals are stretched, and below which that is taken back."""
+"""Shares of one core above which intervals are stretched, and below which that is undone."""
 
 BUSY_WEIGHT = 0.2
-"""Of the newest look, each second, in the average: what is over in a second or two stretches nothing."""
+"""Weight of the newest sample, each second, in the average: load that is over in a second or two stretches nothing."""
 
 STRETCH_STEP = 1.25
 MAX_STRETCH = 8.0
@@ -35,16 +35,16 @@ ADMITTED_PER_S = 150.0
 """Registrations that one core handles in a second."""
 
 LEAST_RECONNECT_S = 1.0
-"""As far apart may the attempts of a small fleet be."""
+"""Interval allowed between the attempts of a small fleet."""
 
 WORTH_TELLING = 1.25
-"""The interval changes by this factor at least: not with each sidecar that comes."""
+"""The interval changes at least by this factor: not with each sidecar that comes."""
 
 FAR_OFF = 2.0
 """A sidecar is told at once when its interval is off by this factor ..."""
 
 SETTLED_S = 10.0
-"""... and otherwise when the interval has stood for so long: while a fleet comes, it changes each second, and every
+"""... and otherwise when the interval has stood for this long: while a fleet comes, it changes each second, and every
 sidecar would be told four times."""
 
 
@@ -58,7 +58,7 @@ class Pacing:
         self._sidecars = 0
         self._busy = 0.0
         self._since = -math.inf
-        """When the interval changed last."""
+        """When the interval last changed."""
         self.interval_s = interval_s
 
     @property
@@ -68,11 +68,12 @@ class Pacing:
 
     @property
     def reconnect_max_s(self) -> float:
-        """How far apart a sidecar's attempts to connect may be: so many come back in this time as are let in in it."""
+        """How far apart a sidecar's attempts to connect may be: in this time as many come back as are let in."""
         return min(max(self._sidecars / ADMITTED_PER_S, LEAST_RECONNECT_S), MAX_INTERVAL_S)
 
     def follow(self, sidecars: int, now: float, busy: float | None = None) -> None:
-        """So many are there, or about to be; `busy` is the share of one core taken lately, if that is news."""
+        """Note how many there are, or are about to be; `busy` is the share of one core used recently, if that is
+        news."""
         self._sidecars = sidecars
         if busy is not None:
             self._busy += BUSY_WEIGHT * (busy - self._busy)
@@ -90,7 +91,7 @@ class Pacing:
             self._since = now
 
     def worth_telling(self, told_s: float, now: float) -> bool:
-        """Whether a sidecar that was told this interval is to be told the one in force."""
+        """Return whether a sidecar that was told this interval should be told the one in force."""
         if told_s == self.interval_s:
             return False
         return _is_far(told_s, self.interval_s, FAR_OFF) or now - self._since >= SETTLED_S

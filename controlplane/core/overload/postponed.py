@@ -1,6 +1,6 @@
-"""How often leases are put off since what their sidecars said was not read yet: a sign that the control plane is late.
+"""Counts leases put off because their sidecars' messages were not read yet: a sign that the control plane is late.
 
-Or that one member lets bytes come of which nothing can be made: so each member counts a few times at most.
+Or one member sends bytes that make no message: so each member counts a few times at most.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ COUNTED_BURST = 2.0
 """Times that one member counts at once."""
 
 COUNTED_PER_S = 2.0 / 300.0
-"""After that: in the five minutes that the alert looks at, less than half of what calls it."""
+"""Rate after that: in the five minutes that the alert looks at, less than half of what triggers it."""
 
 
 class Postponed:
@@ -28,5 +28,5 @@ class Postponed:
         self.counted = 0
 
     def note(self, name: NodeName, now: float) -> None:
-        """The lease of this member is put off."""
+        """Note that the lease of this member is postponed."""
         self.counted += self.shares.of(name, now).take(now)

@@ -1,6 +1,6 @@
-"""Members that register all the time: each registration is told to all others and logged, so each has its share.
+"""Limits members that register all the time: all others are told of each registration, and it is logged.
 
-One beyond it is refused: its sidecar tries again a little later, as after every refusal.
+One beyond the member's share is refused: its sidecar tries again a little later, as after every refusal.
 """
 
 from __future__ import annotations
@@ -17,10 +17,10 @@ STARTS_BURST = 30.0
 """A day of somebody who looks for a mistake, in minutes."""
 
 STARTS_PER_S = 0.2
-"""After that. All others are told of a start, with all that the member offers."""
+"""Rate after that. All others are told of a start, with all that the member offers."""
 
 RETURN_COST = 0.2
-"""Of a run that only connects again, of which nobody need be told, in starts: one a second."""
+"""Cost, in starts, of a run that only connects again, of which nobody need be told: one a second."""
 
 
 class RegistrationShare:
@@ -30,5 +30,5 @@ class RegistrationShare:
         self.shares = MemberTable(lambda now: TokenBucket(rate=STARTS_PER_S, burst=STARTS_BURST, now=now))
 
     def take(self, name: NodeName, now: float, *, new_run: bool) -> bool:
-        """Count a registration; False if that is more than the member's share."""
+        """Count a registration; return False if that exceeds the member's share."""
         return self.shares.of(name, now).take(now, 1.0 if new_run else RETURN_COST)

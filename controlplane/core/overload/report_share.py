@@ -1,9 +1,9 @@
-"""How fast the reports of each member are read: what is not read waits where it is sent.
+"""Limits how fast the reports of each member are read: unread data waits at its sender.
 
-One member alone gets `ENTRIES_PER_S`. That is a part of a core, so many members who all send as much as they may would
+One member alone gets `ENTRIES_PER_S`. That is part of a core, so many members that all send as much as they may would
 take the whole of it. While the loop is busy, and reports are a good part of what it does, there is a level as well:
-nobody's reports are read faster than that. It is where those who send most have to be held for the rest to fit
-(max-min fairness), so who sends less than the level, as every member with ordinary reports does, notices nothing. The
+nobody's reports are read faster than that. It is the level to which those who send most have to be held for the rest to
+fit (max-min fairness), so a member that sends less, as every member with ordinary reports does, notices nothing. The
 level goes down as long as the loop is busy, and up again when it is not.
 
 Times are monotonic seconds.
@@ -27,7 +27,7 @@ ENTRIES_PER_S = 2000.0
 reports 1300 a second."""
 
 ENTRIES_BURST = 20_000.0
-"""One report as large as can be, and half of another."""
+"""One report of maximum size, and half of another."""
 
 LEAST_BURST = 2000.0
 """The same while there is a level: three reports of that robot."""
@@ -36,25 +36,25 @@ BUSY, IDLE = 0.8, 0.6
 """Shares of one core, taken by the loop, above which the level goes down, and below which it goes up."""
 
 LEAST_ENTRIES_PER_S = 7500.0
-"""Of all members together there is always room for so many: a third of a core. What else makes the loop busy, such as
-a fleet that comes back, slows no reports below that."""
+"""All members together always have room for this many: a third of a core. Other causes of a busy loop, such as a fleet
+that comes back, slow no reports below that."""
 
 RISE = 1.1
-"""By this factor the level goes up with each look at the load, once a second."""
+"""Factor by which the level rises with each look at the load, once a second."""
 
 BUSY_WEIGHT = 0.3
-"""Of the newest look in the average of the load."""
+"""Weight of the newest sample in the average of the load."""
 
 MEMORY_S = 3.0
-"""Entries count for about so long: a flood is noticed within a second or two."""
+"""Entries count for about this long: a flood is noticed within a second or two."""
 
 
 @dataclass(slots=True)
 class _Member:
     debt: float
-    """Entries taken and not paid for by time yet."""
+    """Entries taken and not yet paid for by time."""
     recent: float
-    """Entries taken lately, those of long ago less and less."""
+    """Entries taken recently, older ones with less and less weight."""
     at: float
 
     @classmethod
@@ -78,7 +78,7 @@ class ReportShares:
         return min(ENTRIES_PER_S, self._level)
 
     def take(self, name: NodeName, entries: int, now: float) -> bool:
-        """A report of so many entries was read; whether nothing more is to be read of this member for a while."""
+        """Note that a report of this many entries was read; return whether to stop reading this member for a while."""
         member = self.members.of(name, now)
         self._pass(member, now)
         member.debt += entries
@@ -88,7 +88,7 @@ class ReportShares:
         return waits
 
     def wait_s(self, name: NodeName, now: float) -> float:
-        """For how long nothing more is to be read of this member, as the level is now."""
+        """Return for how long nothing more is to be read of this member, at the present level."""
         member = self.members.get(name)
         if member is None:
             return 0.0
@@ -106,7 +106,7 @@ class ReportShares:
         member.recent *= math.exp(-passed_s / MEMORY_S)
 
     def follow(self, busy: float, now: float) -> None:
-        """The loop took this share of one core since the last call, about a second ago."""
+        """Note that the loop took this share of one core since the last call, about a second ago."""
         self._busy += BUSY_WEIGHT * (busy - self._busy)
         if self._busy < IDLE:
             self._level = self._level * RISE if self._level < ENTRIES_PER_S else math.inf
@@ -120,7 +120,7 @@ class ReportShares:
 
 
 def level(rates: Sequence[float], room: float) -> float:
-    """Where the highest of these have to be cut for all together not to exceed `room`; infinite if they do not."""
+    """Return where the highest of these have to be cut for their sum to fit `room`; infinite if it fits."""
     if sum(rates) <= room:
         return math.inf
     left, count = room, len(rates)

@@ -1,4 +1,4 @@
-"""How much of what is solved at once is for one robot.
+"""Limits how much of what is solved at once is for one robot.
 
 A robot whose paths go up and down all the time, or that says so, is drawn and solved at once as often as its share
 lasts, and after that with the next routine solving: others' news wait for it no longer than for anyone's.
@@ -19,14 +19,14 @@ PAIRS_BURST = 2000.0
 50 times, those of one with 8 interfaces and 4 services on 16 servers 4 times."""
 
 PAIRS_PER_S = 100.0
-"""After that."""
+"""Rate after that."""
 
 LEAST_PAIRS = 40
-"""A robot counts as so many at least: each drawing is a picture of the whole fleet, too."""
+"""Minimum cost of a robot: each drawing is a picture of the whole fleet, too."""
 
 
 class Urgency:
-    """Counts what each robot has had. Times are monotonic seconds."""
+    """Counts what each robot has used. Times are monotonic seconds."""
 
     def __init__(self) -> None:
         self.shares = MemberTable(lambda now: TokenBucket(rate=PAIRS_PER_S, burst=PAIRS_BURST, now=now))
@@ -34,7 +34,7 @@ class Urgency:
         """News that had to wait for a routine solving."""
 
     def take(self, robot: NodeName, pairs: int, now: float) -> bool:
-        """Whether this robot, which takes so many pairs to draw, may be drawn at once."""
+        """Return whether this robot, which takes this many pairs to draw, may be drawn at once."""
         taken = self.shares.of(robot, now).take(now, min(max(pairs, LEAST_PAIRS), PAIRS_BURST))
         self.held += not taken
         return taken
