@@ -1,8 +1,8 @@
 """Answers STUN Binding requests (RFC 8489 section 6.3.1). Sans-IO.
 
-Anyone may ask from a forged source address, so an answer is never worth forging for: a success is at most 12 bytes
-(IPv4) or 24 bytes (IPv6) longer than its request, plus SOFTWARE where set; a refusal at most 32 bytes. And no source
-is answered more often than `source_limits.py` allows.
+Anyone may ask from a forged source address, so an answer must never be worth forging for: a success is at most 12 bytes
+(IPv4) or 24 bytes (IPv6) longer than its request, plus SOFTWARE where set; a refusal at most 32 bytes. And no source is
+answered more often than `source_limits.py` allows.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ class StunOutcome(enum.StrEnum):
 
     ANSWERED = "answered"
     REFUSED = "refused"
-    """Answered with 420: the request relies on an extension that is not spoken here."""
+    """Answered with 420: the request relies on an extension that is not supported here."""
     NOT_STUN = "not_stun"
     MALFORMED = "malformed"
     NOT_A_REQUEST = "not_a_request"
@@ -43,7 +43,7 @@ class StunResponder:
         self._software = software
 
     def respond(self, data: bytes | memoryview, source: Address, now: float) -> bytes | None:
-        """The response to send back to `source`, or None."""
+        """Return the response to send back to `source`, or None."""
         outcome, response = self._respond(data, source, now)
         self.outcomes[outcome] += 1
         return response
@@ -80,7 +80,7 @@ def _answer(data: bytes | memoryview, source: Address, software: str | None) -> 
         request.transaction_id,
         xor_mapped_address=source,
         software=software,
-        # RFC 8489 section 7: it comes back when the request has it, and costs nothing where it does not.
+        # RFC 8489 section 7: it is returned when the request has it, and costs nothing when it does not.
         fingerprint=request.fingerprint,
     )
     return StunOutcome.ANSWERED, encode(success)

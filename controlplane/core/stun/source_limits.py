@@ -1,7 +1,7 @@
-"""How often one source is answered over UDP, where the source may be forged.
+"""Limits how often one source is answered over UDP, where the source may be forged.
 
-An answer goes to whoever the datagram claims to come from, so that each address is sent no more than a sidecar's own
-questions would be. Sources are told apart as far as one subscriber can not choose: an IPv4 address, an IPv6 /64.
+An answer goes to whatever address the datagram claims to come from. So each address is sent no more than a sidecar's
+own questions would be. Sources are told apart by what one subscriber cannot choose: an IPv4 address, an IPv6 /64.
 """
 
 from __future__ import annotations
@@ -16,16 +16,16 @@ if TYPE_CHECKING:
     from protos.model.ids import Address
 
 ANSWERS_PER_S = 50.0
-"""To one source: a hundred robots behind one carrier's NAT, each asking every few seconds."""
+"""Rate to one source: a hundred robots behind one carrier's NAT, each asking every few seconds."""
 
 ANSWERS_BURST = 200.0
-"""To one source at once: the same robots with two interfaces each, when they come back from an outage."""
+"""Burst to one source: the same robots with two interfaces each, when they come back from an outage."""
 
 MAX_SOURCES = 16_384
 """Sources remembered. One that has not asked for ANSWERS_BURST / ANSWERS_PER_S is as good as new, and goes first."""
 
 UNLISTED_ANSWERS_PER_S = 1000.0
-"""To all sources together that find no place: more than a fleet asks, far less than a line carries."""
+"""Rate to all unlisted sources together: more than a fleet asks, far less than a line carries."""
 
 _PREFIX_BYTES = 8
 
@@ -35,14 +35,14 @@ class SourceLimits:
 
     def __init__(self, now: float) -> None:
         self._buckets: OrderedDict[str | bytes, TokenBucket] = OrderedDict()
-        """By when they asked last, oldest first."""
+        """Ordered by when they last asked, oldest first."""
         self._unlisted = TokenBucket(rate=UNLISTED_ANSWERS_PER_S, burst=UNLISTED_ANSWERS_PER_S, now=now)
 
     def __len__(self) -> int:
         return len(self._buckets)
 
     def allows(self, source: Address, now: float) -> bool:
-        """Whether this source may be answered once more."""
+        """Return whether this source may be answered once more."""
         key = _key(source[0])
         bucket = self._buckets.get(key)
         if bucket is None:
@@ -54,7 +54,7 @@ class SourceLimits:
         return bucket.take(now)
 
     def _has_room(self, now: float) -> bool:
-        """Make room by forgetting the source that asked least recently; not one that its bucket still holds back."""
+        """Make room by forgetting the source that asked least recently, unless its bucket still holds it back."""
         if len(self._buckets) < MAX_SOURCES:
             return True
         oldest, bucket = next(iter(self._buckets.items()))
