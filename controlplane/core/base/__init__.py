@@ -1,1 +1,1 @@
-"""Something small kept of each member. Imports nothing of the core."""
+"""Keeps something small for each member. Imports nothing of the core."""

@@ -1,7 +1,7 @@
-"""Something small that is kept of each member, such as its share of what all take turns at.
+"""Keeps something small for each member, such as its share of a resource that all use in turn.
 
-Names are members' to choose, so there is room for twice as many as can be registered; who was looked at longest ago is
-forgotten first, which is counted: what is kept of it begins afresh when it comes again.
+Members choose their names, so there is room for twice as many as can be registered. The one that was looked up longest
+ago is forgotten first, which is counted: what is kept of it begins afresh when it comes again.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ MAX_MEMBERS = 8192
 
 
 class MemberTable(Generic[V]):
-    """Makes what it keeps with `make`, at a time in monotonic seconds."""
+    """Creates what it keeps with `make`, at a time in monotonic seconds."""
 
     def __init__(self, make: Callable[[float], V]) -> None:
         self._make = make
@@ -29,7 +29,7 @@ class MemberTable(Generic[V]):
         return len(self._kept)
 
     def of(self, member: str, now: float) -> V:
-        """What is kept of this member; made if there is nothing."""
+        """Return what is kept of this member; create it if there is nothing."""
         kept = self._kept.get(member)
         if kept is None:
             kept = self._kept[member] = self._make(now)
@@ -40,9 +40,9 @@ class MemberTable(Generic[V]):
         return kept
 
     def get(self, member: str) -> V | None:
-        """What is kept of this member, if anything is."""
+        """Return what is kept of this member, if anything is."""
         return self._kept.get(member)
 
     def values(self) -> Collection[V]:
-        """What is kept of all."""
+        """Return what is kept of all."""
         return self._kept.values()
