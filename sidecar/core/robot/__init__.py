@@ -1,5 +1,5 @@
-"""The robot's role: requests from the application to the first answer.
+"""Plays the robot's role: takes each request from the application to its first answer.
 
-Imports `base`, `wire`, `message`, `seam`, `rules` and `transfer`; `request_table` stands above `dispatch`, that above
-`measure`, that above `request` and `fallback`.
+Imports `base`, `wire`, `message`, `seam`, `rules` and `transfer`. `request_table` stands above `dispatch`, which stands
+above `measure`, which stands above `request` and `fallback`.
 """

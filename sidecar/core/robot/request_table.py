@@ -1,13 +1,13 @@
-"""Robot side: replicate a request, take the first valid response, notice the deadline (paper, figure "Workflow
+"""Robot side: replicates a request, takes the first valid response, notices the deadline (paper, figure "Workflow
 Diagram", request steps 3 to 10).
 
-A copy is one sending of a request to one server. The application judges each answer: one that can not be delivered is a
-copy that failed, and its server is out of favour for a while. When the first good answer wins, the other copies are
-called off: what is unsent of them stays here, and their servers are told. What a called-off copy would have taken,
-nobody knows, and to measure only those that were not called off would flatter every path. So one request in
+A copy is one sending of a request to one server. The application judges each answer: if one cannot be delivered, its
+copy has failed and its server is out of favour for a while. When the first good answer wins, the other copies are
+called off: their unsent parts stay here, and their servers are told. Nobody knows how long a called-off copy
+would have taken, and measuring only the copies that were not called off would flatter every path. So one request in
 `OBSERVED_ONE_IN` is a full race whose copies are all measured, and the others are not measured at all
 (docs/develop/architecture.md, "What is measured").
-In a race, once the deadline is over and another copy has won, a copy that has not arrived is called off: its time in
+In a race, once the deadline has passed and another copy has won, a copy that has not arrived is called off. Its time in
 the network is known to be longer than that, and is reported so.
 """
 
@@ -41,16 +41,17 @@ if TYPE_CHECKING:
     from sidecar.core.rules.service_rule import ServiceRule
 
 MAX_IN_FLIGHT = 8192
-"""Requests that wait for a response."""
+"""Most requests that wait for a response."""
 RETRY_S = 0.05
-"""Twice this, doubled with each copy, until a request that was refused for the moment is asked again, ..."""
+"""A request that was refused for the moment is asked again after twice this, doubled with each copy, ..."""
 MAX_RETRY_S = 2.0
-"""... and no longer than this for the first MAX_COPIES; after that the time doubles again, so that a server that takes
+"""... and after no more than this for the first MAX_COPIES. Then the time doubles again, so that a server that takes
 minutes to start is still asked before the request's lifetime ends, and few bytes travel in vain."""
 MAX_HELD_BYTES = 256 * 1024 * 1024
-"""Payloads of requests until the last copy of each has ended, also while they wait for a path or for room."""
+"""Most payload bytes held. A payload is held until its request's last copy has ended, also while the request waits for
+a path or for room."""
 TIMER_SLACK = 1024
-"""Timers that may come up beyond twice those left by the last sweep, before those of what is over are swept out."""
+"""Timers allowed beyond twice those left by the last sweep, before the next one removes those of finished requests."""
 
 
 class RequestTable:
@@ -98,13 +99,13 @@ class RequestTable:
         self._notice_unreachable(request, now)
 
     def reject(self, request_id: RequestId, service: ServiceName, why: str) -> None:
-        """A request is not taken on."""
+        """Refuse a request of the application."""
         self._parts.stats.requests[service, "rejected"] += 1
         self._parts.measurements.outcome(service, "rejected")
         self._parts.emit(RequestFailed(request_id, service, "rejected", why, 0.0))
 
     def answered_here(self, request_id: RequestId, now: float) -> None:
-        """The application has its answer, not from the network. The request ends at its deadline at the latest."""
+        """Note that the application got its answer on the robot. The request ends at its deadline at the latest."""
         request = self._requests.get(request_id)
         if request is not None and not request.done:
             request.answered_here = True
@@ -135,7 +136,7 @@ class RequestTable:
         self._no_room.consider(request)
 
     def on_room(self, now: float) -> None:
-        """Less waits to be sent than before: send what found no room, each in its turn."""
+        """Send the requests that found no room, each in its turn, since less waits to be sent than before."""
         if len(self._no_room):
             self._backlog.add(partial(self._those_with_room, now), now, "room")
 
@@ -152,7 +153,7 @@ class RequestTable:
             self._start(request, servers, now)
 
     def _rescue(self, request: Request, now: float, *, insist: bool = False, rejected: bool = False) -> None:
-        """See `Dispatching.rescue`. A copy that is alone is looked at as the first one was."""
+        """Rescue a request as in `Dispatching.rescue`, and look at a copy that is alone as at the first one."""
         alone = not request.relied_on()
         self._dispatching.rescue(request, now, insist=insist, rejected=rejected)
         if alone and request.relied_on():
@@ -176,7 +177,7 @@ class RequestTable:
     # -- the peers ------------------------------------------------------------------------------------------------
 
     def on_response(self, server: NodeName, response: ResponseMessage, now: float) -> None:
-        """A copy was answered."""
+        """Take a server's response to a copy."""
         found = self._find(server, response.request_id, response.copy)
         if found is None:
             return
@@ -205,7 +206,7 @@ class RequestTable:
         self._settle(request, now)
 
     def _count_answer(self, request: Request, copy: Copy, answer: Answer) -> None:
-        """Note what an answer tells of its path and server."""
+        """Note what an answer tells about its path and server."""
         self._dispatching.answered(request, copy, answer.processing_s, answer.at)
         if answer.measured:
             took_s = answer.at - copy.sent_at
@@ -239,7 +240,7 @@ class RequestTable:
             self._calling_off.call_off(request, losers, now, untold=winner.path.peer if small else None)
 
     def judge_answer(self, request_id: RequestId, number: int, problem: str | None, now: float) -> None:
-        """An answer that was offered is with the application, or can not be delivered, for this reason."""
+        """Take the application's judgement: the answer offered was delivered, or cannot be because of `problem`."""
         request = self._requests.get(request_id)
         copy = None if request is None or number >= len(request.copies) else request.copies[number]
         if request is None or copy is None or copy.answer is None:
@@ -259,13 +260,13 @@ class RequestTable:
         self._settle(request, now)
 
     def _end_well(self, request: Request, at: float) -> None:
-        """It was answered then."""
+        """Finish a request that was answered at this time."""
         elapsed = at - request.submitted_at
         self._finish(request, "deadline_missed" if elapsed > request.rule.deadline_s else "ok")
         self._parts.stats.durations.setdefault(request.service, Histogram()).record(elapsed)
 
     def _answer_is_bad(self, request: Request, copy: Copy, problem: str, now: float) -> None:
-        """The copy has failed as if its server had not answered; others are asked, for a while in its place."""
+        """Fail the copy as if its server had not answered, and ask others, which replace that server for a while."""
         copy.state = CopyState.REJECTED
         copy.in_time = False
         server = copy.path.peer
@@ -285,7 +286,7 @@ class RequestTable:
                 self._fail(request, "failed", why, now)
 
     def on_rejection(self, server: NodeName, rejection: RejectionMessage, now: float) -> None:
-        """A server did not run a copy, or can not say what came of it."""
+        """Take a server's rejection: it did not run a copy, or cannot say what came of it."""
         found = self._find(server, rejection.request_id, rejection.copy)
         if found is None:
             return
@@ -306,8 +307,8 @@ class RequestTable:
                 elif request.may_be_sent() and (
                     rejection.reason is RejectReason.SERVER_LOST or self._dispatching.candidates(request, rejected=True)
                 ):
-                    # Another server offers it, and is out of reach at present, or will, as the only one died: the first
-                    # path to it that is up takes it.
+                    # Another server offers the service but is out of reach at present, or one will offer it, as the
+                    # only one died. The first path to it that is up takes the request.
                     request.refusal = reason
                     self._requests.strand(request)
                     self._tell_unreachable(request)
@@ -316,7 +317,7 @@ class RequestTable:
         self._settle(request, now)
 
     def _wait_out(self, request: Request, reason: str, now: float) -> None:
-        """Its servers restart, as it seems: it waits for the first that is back, and asks them now and then."""
+        """Let a request wait for the first of its servers, which seem to restart, and ask them now and then."""
         request.refusal = reason
         self._requests.strand(request)
         copies = len(request.copies)
@@ -344,7 +345,7 @@ class RequestTable:
         return request, copy
 
     def on_peer_gone(self, peer: NodeName, now: float) -> None:
-        """A peer's session ended: its copies get no answer any more."""
+        """End the copies at a peer whose session ended: they get no answer any more."""
         copies = self._requests.take_copies_at(peer)
         if copies:
             self._backlog.add(lambda: (partial(self._on_copy_dead, *each) for each in copies), now)
@@ -369,7 +370,7 @@ class RequestTable:
         self._settle(request, now)
 
     def on_path_changed(self, path: PathId, state: PathState, now: float) -> None:
-        """Bring requests whose copies are in trouble to another path."""
+        """Move requests whose copies are in trouble to another path."""
         if state is PathState.UP:
             self._backlog.add(self._in_trouble, now, "in trouble")
             self.on_room(now)
@@ -387,14 +388,14 @@ class RequestTable:
         return (partial(act, request) for request in requests)
 
     def _in_trouble(self) -> Iterator[Step]:
-        """Look after what is nowhere, or only where nothing is heard of it."""
+        """Look after the requests that have no copy under way, or have copies only on paths that are not up."""
         yield from self._each(self._look_after, self._requests.stranded())
         for path in self._requests.paths():
             if self._parts.routes.state(path) is not PathState.UP:
                 yield from self._each(self._look_after, self._requests.over(path))
 
     def _unreachable(self) -> Iterator[Step]:
-        """Look at all services, some at each step: a server out of reach may have been the last of any."""
+        """Look at all services, some at each step: a server out of reach may have been the last of any of them."""
         for number, service in enumerate(self._requests.services()):
             if number % GROUP == 0:
                 yield rest
@@ -402,7 +403,7 @@ class RequestTable:
                 yield from self._each(self._notice_unreachable, self._requests.of(service))
 
     def _look_after(self, request: Request, now: float) -> None:
-        """A path of this request changed: its copies on others than those that are up are not relied on."""
+        """Stop relying on the request's copies over paths that are not up, since one of its paths changed."""
         if request.done or request.is_answered or request.id not in self._requests:
             return
         for copy in request.pending():
@@ -411,7 +412,7 @@ class RequestTable:
         self._reconsider(request, now)
 
     def on_servers_gained(self, services: Collection[ServiceName], now: float) -> None:
-        """Bring requests that wait for a server to one that offers their service from now on."""
+        """Send requests that wait for a server to one that newly offers their service."""
         for service in services:
             requests = self._requests.of(service)
             if requests:
@@ -419,12 +420,12 @@ class RequestTable:
         self.on_room(now)
 
     def _ask_now(self, request: Request, now: float) -> None:
-        """Whoever refused it for the moment, another server has come, or the same one anew."""
+        """Ask at once, whichever server refused for the moment: another one has come, or the same one again."""
         request.retry_at = None
         self._look_after(request, now)
 
     def withdraw(self, service: ServiceName, reason: str) -> list[Step]:
-        """Return what ends each request that waits at a service which is not offered here any more."""
+        """Return the steps that end each request waiting at a service that is not offered here any more."""
         why = f"withdrawn: {reason}"
         return [partial(self._withdraw, request, why) for request in self._requests.of(service)]
 
@@ -433,7 +434,7 @@ class RequestTable:
             self._end(request, why, now)
 
     def _reconsider(self, request: Request, now: float) -> None:
-        """There is one more way to a server: send what had none, or whose copies are all in trouble."""
+        """Send a request that had no path, or whose copies are all in trouble, as there is one more way to a server."""
         if request.copies:
             self._rescue(request, now)
         else:
@@ -451,7 +452,7 @@ class RequestTable:
             self._parts.emit(Unreachable(request.id, request.service))
 
     def on_copy_lost(self, message: OutboundMessage, now: float) -> None:
-        """Nothing is heard of a message: if it is a copy with a backup, that one is sent now."""
+        """Send the backup now if the message of which nothing is heard is a copy that has one."""
         request = None if message.copy_of is None else self._requests.get(message.copy_of)
         if request is None or request.done or request.rule.redundancy is not RedundancyMode.BACKUP:
             return
@@ -462,11 +463,11 @@ class RequestTable:
     # -- time -----------------------------------------------------------------------------------------------------
 
     def next_timer(self) -> float | None:
-        """When `handle_timer` is wanted."""
+        """Return when to call `handle_timer`."""
         return first_of(self._timers, self._requests)
 
     def handle_timer(self, now: float) -> None:
-        """Deadlines and lifetimes that are over, as many as the turn has room for."""
+        """Handle the deadlines and lifetimes that are over, as many as this turn has room for."""
         while self._timers and self._timers[0][0] <= now and self._backlog.allows(now):
             _, request_id = heapq.heappop(self._timers)
             request = self._requests.get(request_id)
@@ -486,12 +487,12 @@ class RequestTable:
             if request.done:
                 self._settle(request, now)
             elif request.judged:
-                pass  # in a moment it is answered, in time, or rescued
+                pass  # about to be answered, in time, or rescued
             elif request.answered_here:
                 self._end_answered_here(request, now)
             elif not request.missed:
                 self._miss(request)
-                if request.rule.idempotent and request not in self._no_room:  # it does not get past those that wait
+                if request.rule.idempotent and request not in self._no_room:  # it does not overtake those that wait
                     self._rescue(request, now, insist=True)
 
     def _miss(self, request: Request) -> None:
@@ -500,14 +501,14 @@ class RequestTable:
         self._parts.emit(DeadlineMissed(request.id, request.service, request.rule.deadline_s, copies))
 
     def _end_answered_here(self, request: Request, now: float) -> None:
-        """What the network has not answered by the deadline it need not answer any more: it missed."""
+        """End a request that the network has not answered by the deadline: it missed and need not answer any more."""
         if not request.observed:
             self._calling_off.call_off(request, request.pending(), now)
         self._fail(request, "deadline_missed", "answered on the robot meanwhile", now)
         self._settle(request, now)
 
     def _measure(self, request: Request, now: float) -> None:
-        """Which copies missed the deadline is known: note it, once."""
+        """Note, once, which copies missed the deadline, as that is known now."""
         if not request.outcomes_measured:
             self._dispatching.ended(request, now)
             measure_outcomes(request, self._parts.measurements)

@@ -1,1 +1,1 @@
-"""Which copies of a request leave, where and when. Imports `robot.measure` and `robot.request`."""
+"""Decides which copies of a request leave, where and when. Imports `robot.measure` and `robot.request`."""

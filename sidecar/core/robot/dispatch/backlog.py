@@ -1,7 +1,7 @@
-"""Robot side: requests that no server's share of the outbox had room for when they might have been sent.
+"""Robot side: holds requests that no server's share of the outbox had room for when they could have been sent.
 
-Requests for the same servers wait in one line for each lane (`room.py`), whatever their services. Who comes later does
-not get past them, but by being more urgent: a server that somebody waits for is full for them, too.
+Requests for the same servers wait in one line for each lane (`room.py`), whatever their services. A later request
+overtakes them only if it is more urgent: a server that somebody waits for is full for later requests, too.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 
 class NoRoom:
-    """Requests without a copy that may be answered; as many as the request table holds."""
+    """Waiting requests, which have no copy that may be answered; as many as the request table holds."""
 
     def __init__(self, dispatching: Dispatching, routes: Routes) -> None:
         self._dispatching = dispatching
@@ -41,13 +41,13 @@ class NoRoom:
         return request.id in self._waiting
 
     def open_to(self, request: Request) -> list[NodeName]:
-        """The servers that have room for the request, and nobody waiting for it."""
+        """Return the servers that have room for the request and that no other request waits for."""
         lane = Lane.of(request.size)
         servers = self._dispatching.candidates(request)
         return self._dispatching.with_room((each for each in servers if (lane, each) not in self._awaited), request)
 
     def consider(self, request: Request, *, rejected: bool = False) -> None:
-        """Let a request wait if it could be sent now (again), and room is all that it lacks."""
+        """Let a request wait if it could be sent now (or again) and lacks nothing but room."""
         if request.id in self._waiting or request.answered_here or not request.may_be_sent():
             return
         reached = self._reached(self._dispatching.candidates(request, rejected=rejected))
@@ -65,7 +65,7 @@ class NoRoom:
         line.add(request.id, request.rule.priority, request.deadline_at, request.size)
 
     def remove(self, request: Request, *, went: bool = False) -> None:
-        """It is over, or its turn has come (`went`); or it did not wait."""
+        """Remove a request that is over, or whose turn has come (`went`), if it waits."""
         _, group = self._waiting.pop(request.id, (request, None))
         if group is None:
             return
@@ -83,9 +83,9 @@ class NoRoom:
                 del self._awaited[place]
 
     def going(self, now: float) -> Iterator[tuple[Request, list[NodeName]]]:
-        """Remove and return those that there is room for, each in its turn, and the servers that have it.
+        """Remove and yield the requests that there is room for, each in its turn, with the servers that have it.
 
-        Each is to be sent before the next one is asked for.
+        The caller sends each before it asks for the next one.
         """
         full: set[tuple[Lane, NodeName]] = set()
         before = len(self) + 1
@@ -104,7 +104,7 @@ class NoRoom:
                 yield request, room
 
     def _heads(self, now: float) -> list[Request]:
-        """Return the one of each line whose turn it is, the most urgent first."""
+        """Return the request of each line whose turn it is, the most urgent first."""
         found = (line.first(now) for line in list(self._lines.values()))
         heads = [self._waiting[request_id][0] for request_id in found if request_id is not None]
         return sorted(heads, key=lambda request: (request.rule.priority, request.deadline_at))

@@ -1,9 +1,9 @@
-"""Robot side: what extra copies of requests may cost on each interface.
+"""Robot side: limits what extra copies of requests may cost on each interface.
 
-A bucket of tokens as in gRFC A6 (gRPC's retry throttling), in bytes: requests answered in time fill it, extra copies
-empty it, and without tokens none is sent. When nothing is answered, nothing is earned, so copies never make an overload
-worse. Each copy counts with the bytes of its message, without headers, repair symbols, what is lost and sent again, and
-answers.
+Each limit is a token bucket as in gRFC A6 (gRPC's retry throttling), in bytes. Requests answered in time fill it, extra
+copies empty it, and without tokens none is sent. When nothing is answered, nothing is earned, so copies never make an
+overload worse. Each copy counts with the bytes of its message; headers, repair symbols, retransmissions and answers do
+not count.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from sidecar.core.seam.stats import EngineStats
 
 MAX_SAVED_BYTES = 32 * 1024 * 1024
-"""What a bucket holds: twice the largest request."""
+"""Capacity of a bucket: twice the largest request."""
 DAY_S = 86_400.0
 
 
@@ -33,7 +33,7 @@ class _Purse:
     spent_today: int = 0
 
     def refusal(self, size: int, now: float) -> str | None:
-        """The limit that forbids to spend so much, if any does."""
+        """Return the limit that forbids spending `size` bytes; None if none does."""
         budget = self.budget
         if budget is None:
             return None
@@ -56,11 +56,11 @@ class Budgets:
         self._purses: dict[InterfaceName, _Purse] = {}
 
     def __bool__(self) -> bool:
-        """Whether anything is limited."""
+        """Return whether anything is limited."""
         return any(one.limits for one in self._budgets)
 
     def earn(self, size: int, interfaces: Iterable[InterfaceName]) -> None:
-        """A request of `size` bytes was answered in time; `interfaces` are those that its mapping names."""
+        """Credit every purse with a request of `size` bytes answered in time; its mapping names `interfaces`."""
         for interface in interfaces:
             self._purse(interface)
         for purse in self._purses.values():
@@ -68,14 +68,14 @@ class Budgets:
                 purse.saved = min(purse.saved + purse.budget.extra_load * size, MAX_SAVED_BYTES)
 
     def allows(self, interface: InterfaceName, service: ServiceName, size: int, now: float) -> bool:
-        """Whether an extra copy of `size` bytes may be sent now; if not, it is counted as refused."""
+        """Return whether an extra copy of `size` bytes may be sent now; if not, count it as refused."""
         refusal = self._purse(interface).refusal(size, now)
         if refusal is not None:
             self._stats.copies_refused[interface, service, refusal] += 1
         return refusal is None
 
     def spend(self, interface: InterfaceName, size: int) -> None:
-        """An extra copy of `size` bytes was sent, which was allowed."""
+        """Charge an extra copy of `size` bytes that was allowed and sent."""
         purse = self._purse(interface)
         purse.saved -= size
         purse.spent_today += size

@@ -1,4 +1,4 @@
-"""Robot side: copies that nobody waits for any more are taken back, and their servers told."""
+"""Robot side: takes back copies that nobody waits for any more, and tells their servers."""
 
 from __future__ import annotations
 
@@ -18,17 +18,17 @@ if TYPE_CHECKING:
     from sidecar.core.transfer.routes import Routes
 
 MAX_CALLED_OFF = 1024
-"""Ids of requests whose copies were called off, kept to tell answers that were on their way from strays."""
+"""Most ids of requests with called-off copies, kept to tell answers that were on their way from strays."""
 SMALL_ANSWER_BYTES = 1024
-"""An answer that fits one datagram with its head. Its server sent it to its other copies as well: a cancel would cost
-more than is left to be saved there."""
+"""Largest answer that fits one datagram with its header. Its server has sent it to its other copies as well: a cancel
+would cost more than it could save there."""
 CANCEL_DEADLINE_S = 0.1
-"""A cancel is worth most at once: a server that has not begun need not. Among what is urgent, others go first only if
-their own time is shorter."""
+"""Deadline of a cancel. It is worth most at once, as a server that has not begun need not. Of the urgent messages only
+those with a shorter deadline go first."""
 
 
 class CallingOff:
-    """Calls copies off, and remembers of which requests."""
+    """Calls copies off, and remembers their requests."""
 
     def __init__(self, routes: Routes, outbox: Outbox, stats: EngineStats) -> None:
         self._routes = routes
@@ -37,16 +37,16 @@ class CallingOff:
         self._requests: OrderedDict[RequestId, None] = OrderedDict()
 
     def __contains__(self, request_id: RequestId) -> bool:
-        """Whether copies of this request were called off lately."""
+        """Return whether copies of this request were called off recently."""
         return request_id in self._requests
 
     def __len__(self) -> int:
-        """How many requests are remembered."""
+        """Return the number of requests remembered."""
         return len(self._requests)
 
     def call_off(self, request: Request, copies: list[Copy], now: float, *, untold: NodeName | None = None) -> None:
-        """Send no more of these copies; tell their servers, except for `untold` and where nothing of them went to them
-        or another copy is still awaited."""
+        """Send no more of these copies. Tell their servers, except `untold`, servers that nothing of them may have left
+        for, and servers at which another copy is still awaited."""
         for copy in copies:
             copy.state = CopyState.DEAD
             copy.ended_at = now

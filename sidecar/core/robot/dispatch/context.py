@@ -1,4 +1,4 @@
-"""Robot side: what the table of requests works with."""
+"""Robot side: bundles what the request table works with."""
 
 from __future__ import annotations
 
@@ -35,9 +35,9 @@ class RequestParts:
     stats: EngineStats
     emit: Callable[[ApplicationEvent], None]
     seek: Callable[[frozenset[NodeName]], None]
-    """Asks the links to look for a path to any of these peers."""
+    """Ask the links to look for a path to any of these peers."""
     budgets: tuple[Budget, ...] = ()
-    """What extra copies may cost."""
+    """Limits on the cost of extra copies."""
     backlog: Backlog = field(default_factory=Backlog)
     in_flight: RequestIndex = field(default_factory=RequestIndex)
     penalties: Penalties = field(default_factory=Penalties)

@@ -1,7 +1,7 @@
-"""Robot side: which copies of a request are sent, over which paths, and when.
+"""Robot side: decides which copies of a request are sent, over which paths, and when.
 
-The mapping names the pairs of an interface and a server, the service's `RedundancyMode` says how many of them carry a
-copy at once. Every copy sent while another one is awaited is an extra one, which the interface's budget has to allow.
+The mapping names pairs of an interface and a server; the service's `RedundancyMode` says how many of them carry a copy
+at once. Every copy sent while another one is awaited is an extra one, which the interface's budget has to allow.
 """
 
 from __future__ import annotations
@@ -27,9 +27,9 @@ if TYPE_CHECKING:
     from sidecar.core.wire.messages import Encoded
 
 MAX_COPIES = 8
-"""Copies of one request, those sent in trouble included."""
+"""Most copies of one request, including those sent in trouble."""
 MAX_ASKED = 16
-"""As MAX_COPIES, while it is certain that no server ran any of them, and each was given its time to become ready."""
+"""The same while it is certain that no server ran any of them, and each was given time to become ready."""
 
 
 class _Why(enum.Enum):
@@ -40,8 +40,8 @@ class _Why(enum.Enum):
 
 
 _PLANNED = frozenset((_Why.MAPPED, _Why.HEDGE))
-"""Copies that may leave a request to each other, unless it is a full race: that measures what each path does alone.
-What is sent in trouble waits for none, and on what explores nothing relies."""
+"""Kinds of copies that may leave a request to each other, unless it is a full race, which measures each path alone. A
+copy sent in trouble waits for no other, and nothing relies on a copy that explores."""
 
 
 class Dispatching:
@@ -56,12 +56,12 @@ class Dispatching:
         self._budgets = Budgets(parts.budgets, parts.stats)
 
     def with_room(self, servers: Iterable[NodeName], request: Request) -> list[NodeName]:
-        """Those of the servers to which the request may be sent now."""
+        """Return those of the servers to which the request may be sent now."""
         has_room = self._parts.outbox.has_room
         return [server for server in servers if has_room(server, request.size)]
 
     def candidates(self, request: Request, *, rejected: bool = False) -> tuple[NodeName, ...]:
-        """The servers that may be sent a copy of a request, another one if it has copies; `rejected` as in `rescue`."""
+        """Return the servers that may be sent a copy of a request, or a further one; `rejected` as in `rescue`."""
         servers = self._parts.offers.servers(request.service)
         if not request.copies:
             return servers
@@ -70,7 +70,7 @@ class Dispatching:
         return request.worth_another_copy(servers, rejected=rejected)
 
     def start(self, request: Request, servers: Collection[NodeName], now: float) -> float | None:
-        """Send the first copies to some of these servers; returns when `look_again` is wanted, if at all."""
+        """Send the first copies to some of these servers; return when to call `look_again`, if at all."""
         rule = request.rule
         servers = self._favoured(servers, now)
         chosen = self._parts.mapping.choose(request.service, servers, idempotent=rule.idempotent)
@@ -89,7 +89,7 @@ class Dispatching:
         return look_at
 
     def _favoured(self, servers: Collection[NodeName], now: float) -> Collection[NodeName]:
-        """Those within reach that give good answers; the others where there is no such."""
+        """Return the servers within reach that are in favour; others only if there are none."""
         reached = [server for server in servers if self._parts.routes.reaches(server)]
         return self._parts.penalties.favoured(reached or servers, now)
 
@@ -101,9 +101,9 @@ class Dispatching:
             self.rescue(request, now)
 
     def _best_first(self, request: Request, paths: Iterable[PathId], now: float) -> list[PathId]:
-        """Those that are up first; among them those that missed least lately, then the fastest.
+        """Sort paths: those that are up first, among them those that missed least recently, then the fastest.
 
-        With RedundancyMode.ADAPTIVE the fastest at present: what is missed or rescued makes a pair slow as well.
+        With RedundancyMode.ADAPTIVE the currently fastest come first: misses and rescues make a pair slow as well.
         """
         adaptive = request.rule.redundancy is RedundancyMode.ADAPTIVE
 
@@ -116,7 +116,7 @@ class Dispatching:
         return sorted(paths, key=order)
 
     def first_look(self, request: Request, now: float) -> float | None:
-        """Return when `look_again` is wanted at a request one copy of which was just sent, if at all."""
+        """Return when to call `look_again` for a request of which one copy was just sent, if at all."""
         waiting = request.relied_on()
         if not waiting or now >= request.deadline_at or not request.rule.redundancy.helps:
             return None
@@ -130,21 +130,21 @@ class Dispatching:
         return half if request.rule.idempotent and len(request.asked()) == 1 else None
 
     def _adapt(self, request: Request, now: float) -> float | None:
-        """Send further copies as the target asks for; returns when to look again, None if that has no sense."""
+        """Send the further copies that the target requires; return when to look again, None if that is pointless."""
         while True:
             miss = self._adaptive.miss_probability(request, now)
             path = self._next_over_another_interface(request, now)
             if path is None or not self._adaptive.needs(request, path, miss, now):
                 break
             if not self._send(request, path, now, _Why.HEDGE):
-                return None  # no budget: to ask for it again and again would only count as so many refusals
+                return None  # no budget: asking again and again would only add refusals to the count
         if path is None and now >= request.submitted_at + HEDGE_AT * request.rule.deadline_s:
             self._ask_another_server(request, now)
         look_at = self._adaptive.next_look(request, now)
         return look_at if look_at < request.deadline_at else None
 
     def look_again(self, request: Request, now: float) -> float | None:
-        """The moment that `start` or the last call named has come; returns when to look once more."""
+        """Look at a request at the moment named by `start` or the last call; return when to look once more."""
         if request.done or request.is_answered or not request.relied_on():
             return None
         if request.rule.redundancy is RedundancyMode.ADAPTIVE:
@@ -155,9 +155,9 @@ class Dispatching:
     def _hedge(self, request: Request, now: float) -> None:
         """Send another copy if that promises anything.
 
-        With RedundancyMode.HEDGE, over another interface. Else, and where there is none, to another server if the only
-        one asked has the request and is silent: it may have died unnoticed. Not over the same interface when the
-        request has not arrived: then the path is slow, which another copy would only make worse.
+        With RedundancyMode.HEDGE it goes over another interface. Otherwise, or if there is none, it goes to another
+        server if the only one asked has the request and is silent: it may have died unnoticed. It does not go over the
+        same interface when the request has not arrived: then the path is slow, and another copy would make it worse.
         """
         waiting = request.relied_on()
         if request.rule.redundancy is RedundancyMode.HEDGE:
@@ -169,12 +169,12 @@ class Dispatching:
         self._ask_another_server(request, now)
 
     def _ask_another_server(self, request: Request, now: float) -> None:
-        """Also over the same interface, if the only server asked has the request and is silent."""
+        """Ask another server, also over the same interface, if the only one asked has the request and is silent."""
         if request.rule.idempotent and request.waits_for_one_server():
             self.rescue(request, now, insist=True)
 
     def rescue(self, request: Request, now: float, *, insist: bool = False, rejected: bool = False) -> None:
-        """Send one more copy when none that is relied on is on a path that is up (or when `insist`).
+        """Send one more copy when no copy that is relied on is on a path that is up (or when `insist`).
 
         A request that is not idempotent may go to another server only when it is certain that none has run it.
         """
@@ -183,7 +183,7 @@ class Dispatching:
         if request.is_answered or (waiting and not request.rule.redundancy.helps):
             return
         if rejected and len(request.copies) >= MAX_COPIES:
-            return  # its retry asks on, without haste
+            return  # its retry goes on asking, without haste
         alive = any(routes.state(copy.path) is not PathState.DOWN for copy in waiting)
         if alive and not insist and request.rule.redundancy is RedundancyMode.ADAPTIVE:
             self._adapt(request, now)
@@ -196,11 +196,11 @@ class Dispatching:
         if path is None:
             return
         if any(copy.path.interface == path.interface and self._is_on_its_way(copy) for copy in waiting):
-            return  # another one behind it would only make it later
+            return  # another copy behind it would only delay it
         self._send(request, path, now, _Why.TROUBLE)
 
     def _is_on_its_way(self, copy: Copy) -> bool:
-        """Whether its server may not have all of it yet, as its path is slow and not silent."""
+        """Return whether its server may not have all of it yet because its path is slow but not silent."""
         return not copy.message.newest.over and self._parts.routes.state(copy.path) is PathState.UP
 
     def _next_over_another_interface(self, request: Request, now: float) -> PathId | None:
@@ -209,7 +209,7 @@ class Dispatching:
         return None if path is None or path.interface in used else path
 
     def _next_withheld(self, request: Request, now: float) -> PathId | None:
-        """The best path that is up of those its mapping names and that carry no copy, to a server that may run it."""
+        """Return the best mapped path that is up and carries no copy, to a server that may run it."""
         waiting = {copy.path.peer for copy in request.relied_on()}
         refused = {copy.path.peer for copy in request.copies if copy.refused}
         for path in request.withheld:
@@ -228,9 +228,9 @@ class Dispatching:
         return self._parts.mapping.rescue(self.with_room(servers, request))
 
     def _take_back(self, request: Request, waiting: list[Copy], now: float) -> PathId | None:
-        """Free a request that is not idempotent from a server that nothing leads to, if nothing has left for it.
+        """Take a request that is not idempotent back from a server that no path reaches, if nothing has left for it.
 
-        Returns where it can go instead; without such a path it stays where it is.
+        Return the path it can take instead; without one it stays where it is.
         """
         routes, outbox = self._parts.routes, self._parts.outbox
         if request.rule.idempotent or not waiting or len(request.pending()) > len(waiting):
@@ -250,19 +250,19 @@ class Dispatching:
         return path
 
     def never_left(self, request: Request, copy: Copy, now: float) -> None:
-        """A copy is over before anything of it left: it has not run, and says nothing of its path or server."""
+        """End a copy of which nothing has left: it has not run, and tells nothing about its path or server."""
         copy.state, copy.ended_at, copy.certainly_not_run = CopyState.DEAD, now, True
         copy.message.newest.stand_down()
         if request.observed and not copy.hedges:
             self._parts.measurements.called_off(request.carried(copy), now - copy.sent_at)
 
     def answered(self, request: Request, copy: Copy, processing_s: float, now: float) -> None:
-        """A copy was answered. After the deadline it had to wait for what is fresh, so its pace means nothing."""
+        """Note an answered copy. After its deadline it had to wait for fresher ones, so its pace means nothing."""
         latency_s = min(now - copy.sent_at, request.rule.deadline_s)
         self._paces.answered(request.service, copy.path, latency_s, processing_s, now)
 
     def ended(self, request: Request, now: float) -> None:
-        """What became of the copies is known, or the deadline is over. Called once for each request."""
+        """Note the outcome of the copies, once for each request: all are known, or the deadline is over."""
         self._records.note(request, now)
         if self._budgets and any(copy.in_time for copy in request.copies):
             paths = (*request.withheld, *(copy.path for copy in request.copies))

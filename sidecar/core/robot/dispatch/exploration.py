@@ -1,10 +1,10 @@
-"""Robot side: now and then, one more copy of a request over a path that is not used otherwise.
+"""Robot side: occasionally sends one more copy of a request over a path that is not used otherwise.
 
-The control plane says which pair of an interface and a server would teach it most (`ServiceMapping.explore`); what it
-learns there is of real requests, which probes are no match for. Where a service's `RedundancyMode` or a budget leaves
-out mapped pairs, these take turns with it. The copy is never in place of a mapped one, and goes
-only beside requests whose copies are all measured anyway (`OBSERVED_ONE_IN`), so that what is measured stays
-unbiased: which request that is depends on its id, nothing else.
+The control plane names the pair of an interface and a server that would teach it most (`ServiceMapping.explore`). There
+it learns from real requests, which probes cannot replace. Where a service's `RedundancyMode` or a budget leaves out
+mapped pairs, these take turns with it. The copy never replaces a mapped one, and accompanies only requests whose copies
+are all measured anyway (`OBSERVED_ONE_IN`), so that measurements stay unbiased: which requests these are depends on
+their ids only.
 """
 
 from __future__ import annotations
@@ -24,26 +24,26 @@ if TYPE_CHECKING:
     from sidecar.core.transfer.routes import Routes
 
 MAX_PER_S = 0.2
-"""Such copies of one service: 12 a minute at most, however many requests there are."""
+"""Most such copies of one service per second: 12 a minute, however many requests there are."""
 
 MAX_SAVED = 6.0
-"""Copies that may be saved up for when much is to be learnt at once: when a mapping got bad."""
+"""Copies that may be saved up for when much is to be learned at once, as when a mapping has become bad."""
 
 MIN_INTERVAL_S = 0.5
-"""Between two copies of one service, so that they do not all meet the same moment."""
+"""Least time between two copies of one service, so that they do not all measure the same moment."""
 
 MAX_REQUEST_BYTES = 128 * 1024
-"""Larger requests are not worth it. A service costs at most 1.6 MB a minute more."""
+"""Larger requests are not worth exploring with. A service costs at most 1.6 MB a minute more."""
 
 MAX_MAPPED_COPIES = 4
-"""A request with more copies gets none besides: half of `dispatcher.MAX_COPIES`, the rest is for trouble."""
+"""A request with more copies does not explore: half of `dispatcher.MAX_COPIES`, the rest is for trouble."""
 
 MAX_WAITING_MESSAGES = 4
-"""An interface with more undelivered messages is busy: a copy that need not be would hold others up."""
+"""An interface with more undelivered messages is busy: an unnecessary copy would hold others up."""
 
 
 class ExplorationBudget:
-    """How many copies one service may still send to explore."""
+    """Budget of the copies that one service may send to explore."""
 
     __slots__ = ("_next_at", "_saved", "_seen_at")
 
@@ -53,16 +53,16 @@ class ExplorationBudget:
         self._next_at = now
 
     def earn(self, share: float, now: float) -> None:
-        """A request came, of a service that may explore with this share of its requests."""
+        """Credit a request of a service that may explore with this share of its requests."""
         self._saved = min(MAX_SAVED, self._saved + min(share, MAX_PER_S * (now - self._seen_at)))
         self._seen_at = now
 
     def suffices(self, now: float) -> bool:
-        """Whether a copy may be sent now."""
+        """Return whether a copy may be sent now."""
         return self._saved >= 1.0 and now >= self._next_at
 
     def spend(self, now: float) -> None:
-        """A copy is sent."""
+        """Charge a copy that is sent."""
         self._saved -= 1.0
         self._next_at = now + MIN_INTERVAL_S
 
@@ -75,11 +75,11 @@ class Exploration:
         self._routes = routes
         self._outbox = outbox
         self._budgets: dict[ServiceName, ExplorationBudget] = {}
-        """Of mapped services."""
+        """Budgets of the mapped services."""
         self._turn = 0
 
     def path(self, request: Request, servers: Collection[NodeName], now: float) -> PathId | None:
-        """The path for one more copy of this request, whose mapped copies have just been sent; mostly None.
+        """Return the path for one more copy of this request, whose mapped copies were just sent; usually None.
 
         `servers` are those that offer the service and have room for the request.
         """
@@ -97,7 +97,7 @@ class Exploration:
         return paths[self._turn % len(paths)]
 
     def _candidates(self, request: Request, servers: Collection[NodeName]) -> list[PathId]:
-        """The pair that the control plane names, and those mapped ones that carry no copy of this request."""
+        """Return the path of the pair that the control plane names, and mapped paths without a copy of this request."""
         found = [path for path in request.withheld if path.peer in servers]
         mapping = self._mapping.services.get(request.service)
         pair = mapping.explore if mapping is not None else None

@@ -1,14 +1,14 @@
-"""Remembers how each pair of an interface and a server answered lately.
+"""Remembers how each pair of an interface and a server answered recently.
 
 `PathPaces` keeps the current latency of a pair, `PathRecords` the outcomes of its last copies.
 
-Pace: two averages stand beside each other. The current one moves half of the way with each answer; the usual one moves
-slowly. The current one fades into the usual one. A copy that has been awaited for longer than both shows that its pair
-is slow now, long before it is answered.
+Pace: each pair has two averages. The current one moves halfway to each answer; the usual one moves slowly. The current
+one fades into the usual one. A copy that has been awaited for longer than both shows that its pair is slow now, long
+before it is answered.
 
-Records: a copy that was called off is known to have taken longer than until then. For a quantile below that moment this
-is as good as the latency itself, and no hedge is sent before the quantile it waits for: so the delay of hedges stays
-true although most slow copies are called off. Which pair misses least follows from measured requests only
+Records: a copy that was called off is known to have taken at least that long. For a quantile below that moment this is
+as good as the latency itself, and no hedge is sent before the quantile it waits for. So the delay of hedges stays right
+although most slow copies are called off. Which pair misses least follows from measured requests only
 (`Request.observed`).
 """
 
@@ -29,11 +29,11 @@ if TYPE_CHECKING:
     from sidecar.core.transfer.routes import Routes
 
 MAX_PACES = 4096
-"""Pairs remembered, each for one service; then the one that was used longest ago goes."""
+"""Pairs remembered, each for one service; beyond that the least recently used one goes."""
 PRESENT_GAIN = 0.5
 USUAL_GAIN = 1 / 16
 FADE_S = 2.0
-"""In which half of what sets the present apart from the usual is forgotten: so long lasts a bad spot on a road."""
+"""Half-life of the gap between current and usual latency: a bad spot on a road lasts about this long."""
 
 
 class _Key(NamedTuple):
@@ -55,7 +55,7 @@ class _Pace:
 
 
 class PathPaces:
-    """The pace of each pair, by service: its requests are taken to be alike in size."""
+    """The pace of each pair, by service: requests of a service are assumed to be alike in size."""
 
     def __init__(self, routes: Routes, stats: EngineStats) -> None:
         self._routes = routes
@@ -63,7 +63,7 @@ class PathPaces:
         self._paces: OrderedDict[_Key, _Pace] = OrderedDict()
 
     def answered(self, service: ServiceName, path: PathId, latency_s: float, processing_s: float, now: float) -> None:
-        """A copy was answered `latency_s` after it was sent, `processing_s` of which was the server's."""
+        """Note a copy that was answered `latency_s` after it was sent, `processing_s` of which the server took."""
         key = _Key(service, path.interface, path.peer)
         pace = self._paces.get(key)
         if pace is None:
@@ -80,17 +80,17 @@ class PathPaces:
         pace.noted_at = now
 
     def takes_at_least(self, service: ServiceName, path: PathId, latency_s: float, now: float) -> None:
-        """A copy that is not answered yet will not be before this latency, as it seems."""
+        """Note that a copy that is not answered yet seems to take at least this latency."""
         pace = self._paces.get(_Key(service, path.interface, path.peer))
         if pace is not None and latency_s > pace.expected_s(now):
             pace.present_s = latency_s
             pace.noted_at = now
 
     def expected_s(self, service: ServiceName, path: PathId, now: float) -> float | None:
-        """What the next answer over this pair takes, in seconds; None when nothing is known of the service.
+        """Return the seconds expected for the next answer over this pair; None when nothing is known about the service.
 
-        A pair that has answered nothing yet is taken for as fast as the fastest other, as far as the networks' round
-        trips are alike.
+        A pair that has answered nothing yet is taken to be as fast as the fastest other one, plus the excess of its
+        network's round trip.
         """
         pace = self._paces.get(_Key(service, path.interface, path.peer))
         if pace is not None:
@@ -105,7 +105,7 @@ class PathPaces:
         return min(guesses, default=None)
 
     def processing_s(self, service: ServiceName, path: PathId) -> float:
-        """What the server needs of that, in seconds; 0 while it has not answered."""
+        """Return the seconds of that which the server needs; 0 while it has not answered."""
         pace = self._paces.get(_Key(service, path.interface, path.peer))
         return 0.0 if pace is None else pace.processing_s
 
@@ -113,18 +113,18 @@ class PathPaces:
 WINDOW = 128
 """Copies remembered for each pair: enough for a quantile of 0.99, see `quantile_s`."""
 MAX_AGE_S = 120.0
-"""A road is another one after so long: older copies tell nothing."""
+"""After two minutes of driving the road has changed; older copies tell nothing."""
 MAX_RECORDS = 4096
-"""Pairs remembered, each for one service; then the one that was used longest ago goes."""
+"""Pairs remembered, each for one service; beyond that the least recently used one goes."""
 PRIOR_COPIES, PRIOR_MISSES = 10.0, 0.5
-"""What is believed of a pair before anything is known: one in twenty misses. A pair that misses more often than that
-loses its place to one never tried, a better one does not."""
+"""Pseudo-counts of a pair about which nothing is known: one copy in twenty misses. A pair that misses more often than
+that loses its place to one never tried; a better one does not."""
 
 
 class _Sample(NamedTuple):
     at: float
     latency_s: float
-    """At least, if it was called off; infinite if it missed the deadline."""
+    """A lower bound if it was called off; infinite if it missed the deadline."""
     measured: bool
 
 
@@ -159,15 +159,15 @@ class PathRecords:
         return [sample for sample in samples if sample.at >= now - MAX_AGE_S]
 
     def miss_share(self, service: ServiceName, path: PathId, now: float) -> float:
-        """What share of its copies the pair is expected to bring back late or never."""
+        """Return the share of its copies that the pair is expected to answer late or never."""
         measured = [sample.latency_s for sample in self._recent(service, path, now) if sample.measured]
         return (measured.count(math.inf) + PRIOR_MISSES) / (len(measured) + PRIOR_COPIES)
 
     def quantile_s(self, service: ServiceName, path: PathId, quantile: float, now: float) -> float | None:
-        """Seconds within which the next copy is answered with at least this probability; None if too few are known.
+        """Return the latency (s) that the next copy keeps with at least this probability; None if too few are known.
 
-        Among n latencies alike the next one is at most the k-th smallest with probability k / (n + 1), whatever their
-        distribution: for 0.95 nineteen are needed. Infinite where the pair misses more often than that.
+        After n exchangeable latencies the next one is at most the k-th smallest with probability k / (n + 1), whatever
+        their distribution: 0.95 needs nineteen. The result is infinite if the pair misses more often than that.
         """
         latencies = sorted(sample.latency_s for sample in self._recent(service, path, now))
         rank = math.ceil(quantile * (len(latencies) + 1))

@@ -1,8 +1,8 @@
-"""Robot side: servers whose answers could not be delivered, and for how long others are asked in their place.
+"""Robot side: puts servers whose answers could not be delivered out of favour, and asks others in their place.
 
-Such a server answers fast, if it is faulty or hostile, and wins the races that it then spoils. So it is out of favour
-for a time that doubles with each bad answer and is forgotten by halves: then it is asked only where no other offers
-the service.
+A faulty or hostile server answers fast and wins the races that it then spoils. So it is out of favour for a time that
+doubles with each bad answer; its bad answers are forgotten with a half-life. Meanwhile it is asked only where no other
+server offers the service.
 """
 
 from __future__ import annotations
@@ -19,23 +19,23 @@ if TYPE_CHECKING:
     from protos.model.ids import NodeName
 
 FIRST_S = 10.0
-"""After the first bad answer it is out of favour for so long, ..."""
+"""Time out of favour after the first bad answer ..."""
 LONGEST_S = 600.0
-"""... and for this at most."""
+"""... and at most."""
 _MOST_DOUBLINGS = math.log2(LONGEST_S / FIRST_S)
-"""Thousands of bad answers may come at once: two to the power of their number is no float."""
+"""Caps the exponent: thousands of bad answers may come at once, and two to that power overflows a float."""
 HALF_LIFE_S = 120.0
-"""In which half of what is held against it is forgotten."""
+"""Half-life of a server's bad answers."""
 FORGOTTEN_BELOW = 0.1
-"""What is held against it is forgotten: seven minutes after a single bad answer."""
+"""Level of bad answers below which a server is forgotten: reached seven minutes after a single bad answer."""
 MAX_SERVERS = 1024
-"""Of more, the one that is back in favour first is forgotten."""
+"""Servers remembered; beyond that the one that is back in favour first is forgotten."""
 
 
 @dataclass(slots=True)
 class _Record:
     level: float
-    """Bad answers, each worth half after HALF_LIFE_S."""
+    """Number of bad answers, each worth half after HALF_LIFE_S."""
     updated_at: float
     until: float
 
@@ -44,7 +44,7 @@ class _Record:
 
 
 class Penalties:
-    """By server, whatever the service: who spoils one is not to be trusted with another."""
+    """Penalties by server, whatever the service: a server that spoils one is not trusted with another."""
 
     __slots__ = ("_records",)
 
@@ -52,7 +52,7 @@ class Penalties:
         self._records: dict[NodeName, _Record] = {}
 
     def bad_answer(self, server: NodeName, now: float) -> float:
-        """It gave an answer that could not be delivered; returns for how long it is out of favour."""
+        """Note an answer that could not be delivered; return for how many seconds its server is out of favour."""
         record = self._records.pop(server, None)
         level = 1.0 + (0.0 if record is None else record.now(now))
         out_s = min(FIRST_S * math.pow(2.0, min(level - 1.0, _MOST_DOUBLINGS)), LONGEST_S)
@@ -61,19 +61,19 @@ class Penalties:
         return out_s
 
     def _forget(self, now: float) -> None:
-        """Called when one more comes, which is rare."""
+        """Forget servers below FORGOTTEN_BELOW, and one if too many remain; called at a bad answer, which is rare."""
         for server in [name for name, record in self._records.items() if record.now(now) < FORGOTTEN_BELOW]:
             del self._records[server]
         if len(self._records) >= MAX_SERVERS:
             del self._records[min(self._records, key=lambda name: self._records[name].until)]
 
     def out_until(self, server: NodeName) -> float:
-        """When it is back in favour; the past, if it is."""
+        """Return when it is back in favour; a time in the past if it is."""
         record = self._records.get(server)
         return -math.inf if record is None else record.until
 
     def report(self, now: float) -> tuple[PenaltyReport, ...]:
-        """Return those that are out of favour, for the control plane."""
+        """Return the servers that are out of favour, for the control plane."""
         return tuple(
             PenaltyReport(server, record.until - now, math.ceil(record.now(now)))
             for server, record in self._records.items()
@@ -81,7 +81,7 @@ class Penalties:
         )
 
     def favoured(self, servers: Iterable[NodeName], now: float) -> tuple[NodeName, ...]:
-        """Return those that are in favour; all, where none is."""
+        """Return the servers that are in favour, or all if none is."""
         every = tuple(servers)
         if not self._records:
             return every

@@ -1,1 +1,1 @@
-"""Local services that stand in for the network. Imports no other package of the robot."""
+"""Lets local services stand in for the network. Imports no other package of the robot."""

@@ -1,10 +1,10 @@
-"""Robot side: when the fallback of a service is asked, and whose answer the application gets: the first.
+"""Robot side: decides when the fallback of a service is asked, and gives the application the first answer.
 
-A request goes to the network at once, and to its fallback when that has to begin to be in time, or at once when no path
-is up or the network has given up. What the network does with the request is measured as if there were no fallback: a
-miss stays a miss.
+A request goes to the network at once. It goes to its fallback when that has to begin to be in time, or at once when no
+path is up or the network has given up. What the network does with the request is measured as if there were no fallback:
+a miss stays a miss.
 
-Like the rest of `core`, this opens nothing: the caller sends what `take_calls` gives, and says what came of it.
+Like the rest of `core`, this opens nothing: the caller sends what `take_calls` returns, and reports the outcome.
 """
 
 from __future__ import annotations
@@ -24,19 +24,19 @@ if TYPE_CHECKING:
     from sidecar.core.seam.application import RequestFailed
 
 MAX_WANTED = 64
-"""Requests that wait for one fallback; a longer queue helps nobody."""
+"""Most requests that wait for one fallback; a longer queue helps nobody."""
 MAX_HELD_BYTES = 256 * 1024 * 1024
-"""Payloads kept for fallbacks, as many as for the network: it may have given up before they have."""
+"""Most payload bytes kept for fallbacks, as many as for the network: it may give up before the fallbacks do."""
 MAX_ATTEMPTS = 4
-"""What was lost with a fallback is asked again, as it may take seconds to start anew; not for ever, as it may have been
-that request's fault."""
+"""Most times that a fallback is asked one request. A request lost with a fallback is asked again, as the fallback may
+take seconds to restart; but not for ever, as the request may have been the cause."""
 
 OUTCOMES = ("started", "won", "late", "too_late", "lost", "missing", "overloaded")
 """Labels of plr_fallback_requests_total."""
 
 
 class FallbackCall(NamedTuple):
-    """Ask the fallback of `service` this."""
+    """A request to ask the fallback of `service`."""
 
     request_id: RequestId
     service: ServiceName
@@ -44,18 +44,18 @@ class FallbackCall(NamedTuple):
 
 
 class Accepted(NamedTuple):
-    """A fallback's answer that the application gets."""
+    """The delivery of a fallback's answer to the application."""
 
     service: ServiceName
     late: bool
-    """After the deadline."""
+    """It came after the deadline."""
 
 
 class Fallbacks:
     """The requests of all services that have a fallback. The caller serialises the calls."""
 
     def __init__(self, rules: Iterable[ServiceRule], outcomes: Counter[tuple[ServiceName, str]]) -> None:
-        """`outcomes` counts (service, one of OUTCOMES)."""
+        """Take the rules; `outcomes` counts (service, one of OUTCOMES)."""
         self._outcomes = outcomes
         self._queues: dict[ServiceName, FallbackQueue] = {
             ServiceName(rule.pattern): FallbackQueue(
@@ -72,32 +72,32 @@ class Fallbacks:
         outcomes.update({(service, outcome): 0 for service in self._queues for outcome in OUTCOMES})
 
     def __len__(self) -> int:
-        """How many requests are remembered."""
+        """Return the number of requests remembered."""
         return len(self._requests)
 
     @property
     def services(self) -> dict[ServiceName, ServiceName]:
-        """Service -> its fallback."""
+        """Return each service's fallback."""
         return {name: queue.rule.service for name, queue in self._queues.items()}
 
     def expected_s(self, service: ServiceName) -> float | None:
-        """Seconds within which its fallback is expected to answer; None while nothing is known."""
+        """Return the seconds within which its fallback is expected to answer; None while nothing is known."""
         return self._queues[service].times.expected_s()
 
     # -- outputs --------------------------------------------------------------------------------------------------
 
     def take_calls(self) -> list[FallbackCall]:
-        """Return what is to be asked of fallbacks."""
+        """Return the calls to make to fallbacks."""
         calls, self._calls = self._calls, []
         return calls
 
     def take_failures(self) -> list[RequestFailed]:
-        """Return the network's last words on requests that their fallbacks will not answer either."""
+        """Return the network's failures of requests that their fallbacks will not answer either."""
         failures, self._failures = self._failures, []
         return failures
 
     def next_timer(self) -> float | None:
-        """When `handle_timer` is wanted."""
+        """Return when to call `handle_timer`."""
         while self._expiries and self._expiries[0][1] not in self._requests:
             heapq.heappop(self._expiries)
         timers = [self._expiries[0][0]] if self._expiries else []
@@ -110,7 +110,7 @@ class Fallbacks:
     # -- the network ----------------------------------------------------------------------------------------------
 
     def submitted(self, request_id: RequestId, service: ServiceName, payload: bytes, now: float) -> None:
-        """A request goes to the network."""
+        """Note that a request goes to the network."""
         queue = self._queues.get(service)
         if queue is None:
             return
@@ -125,13 +125,13 @@ class Fallbacks:
         self._begin_due(service, now)
 
     def unreachable(self, request_id: RequestId, now: float) -> None:
-        """No path to any server is up."""
+        """Note that no path to any server of a request is up."""
         found = self._requests.get(request_id)
         if found is not None and self._queues[found[0]].rule.in_time:
             self._want(*found, now)
 
     def deadline_missed(self, request_id: RequestId, now: float) -> bool:
-        """The network missed the deadline; returns whether the application has no answer yet."""
+        """Note that the network missed the deadline; return whether the application has no answer yet."""
         found = self._requests.get(request_id)
         if found is None:
             return True
@@ -139,12 +139,12 @@ class Fallbacks:
         return not found[1].answered
 
     def has_answered(self, request_id: RequestId) -> bool:
-        """Whether the application has its answer from the fallback."""
+        """Return whether the application has its answer from the fallback."""
         found = self._requests.get(request_id)
         return found is not None and found[1].answered_here
 
     def network_answered(self, request_id: RequestId, now: float) -> None:
-        """A valid answer of the network is there: the application has one."""
+        """Note that the application has a valid answer from the network."""
         found = self._requests.get(request_id)
         if found is not None:
             name, request = found
@@ -153,9 +153,9 @@ class Fallbacks:
             self._call(name, now)
 
     def network_failed(self, failure: RequestFailed, now: float) -> bool:
-        """The network gives no valid answer; returns whether the application gets none at all.
+        """Note that the network gives no valid answer; return whether the application gets none at all.
 
-        If not, it has one, or its fallback may answer: if that fails as well, `take_failures` has it.
+        If False, it has one, or its fallback may answer. If that fails as well, `take_failures` returns the failure.
         """
         found = self._requests.get(failure.request_id)
         if found is None:
@@ -173,7 +173,7 @@ class Fallbacks:
     # -- the fallbacks --------------------------------------------------------------------------------------------
 
     def set_up(self, services: frozenset[ServiceName], now: float) -> None:
-        """The services whose fallback can be asked right now, a whole new set."""
+        """Replace the set of services whose fallback can be asked right now."""
         for name, queue in self._queues.items():
             was_up, queue.up = queue.up, name in services
             if was_up and not queue.up:
@@ -181,12 +181,12 @@ class Fallbacks:
             self._call(name, now)
 
     def replaced(self, service: ServiceName, now: float) -> None:
-        """A fallback was restarted: what it was asked before it will not answer."""
+        """Note that a fallback was restarted: it will not answer what it was asked before."""
         self._lose(service, list(self._queues[service].called.values()))
         self._call(service, now)
 
     def answered(self, request_id: RequestId, now: float) -> Accepted | None:
-        """A fallback answered; None: the application does not get this answer."""
+        """Take a fallback's answer; return None if the application does not get it."""
         found = self._requests.get(request_id)
         if found is None:
             return None  # nobody waits any more
@@ -210,7 +210,7 @@ class Fallbacks:
         return accepted
 
     def refused(self, request_id: RequestId, now: float) -> None:
-        """A fallback could not be asked this, or its answer is none."""
+        """Give up a request that could not be put to its fallback, or whose answer is not valid."""
         found = self._requests.get(request_id)
         if found is not None:
             self._lose(found[0], [found[1]], again=False)
@@ -219,7 +219,7 @@ class Fallbacks:
     # -- time -----------------------------------------------------------------------------------------------------
 
     def handle_timer(self, now: float) -> None:
-        """Ask what has to begin; give up what is older than its lifetime."""
+        """Ask for the requests that have to begin; give up those older than their lifetime."""
         for name, queue in self._queues.items():
             stalled = [request for request in queue.called.values() if queue.stalled_at(request) <= now]
             self._lose(name, stalled)
@@ -260,7 +260,7 @@ class Fallbacks:
         self._call(name, now)
 
     def _call(self, name: ServiceName, now: float) -> None:
-        """Ask as much as there is room for."""
+        """Ask for as many requests as there is room for."""
         queue = self._queues[name]
         while (request := queue.next_call(now)) is not None:
             if queue.is_worthless(request, now):
@@ -271,7 +271,7 @@ class Fallbacks:
             self._calls.append(FallbackCall(request.id, name, request.payload or b""))
 
     def _lose(self, name: ServiceName, requests: list[FallbackRequest], *, again: bool = True) -> None:
-        """Those of these that are at the fallback were asked in vain."""
+        """Take back those of these requests that are at the fallback, and ask for them again if allowed."""
         queue = self._queues[name]
         for request in requests:
             if queue.called.pop(request.id, None) is None:
@@ -283,7 +283,7 @@ class Fallbacks:
                 self._end(name, request)
 
     def _end(self, name: ServiceName, request: FallbackRequest) -> None:
-        """The fallback is not asked for this any more."""
+        """Stop asking the fallback for this request."""
         request.over = True
         if request.failure is not None and not request.answered:
             self._failures.append(request.failure)
@@ -291,7 +291,7 @@ class Fallbacks:
         self._settle(name, request)
 
     def _settle(self, name: ServiceName, request: FallbackRequest) -> None:
-        """Keep nothing that nobody needs."""
+        """Drop what is not needed any more."""
         queue = self._queues[name]
         if not (request.answered or request.over):
             return

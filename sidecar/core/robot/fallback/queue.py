@@ -1,8 +1,8 @@
 """Decides which request of a service its fallback begins next, and when.
 
-The fallback is taken for one server that runs one request after the other. For all to be in time, the request with the
-k-th deadline has to begin k times as long before it as one takes. How long one takes is learned from the fallback's own
-answers.
+The fallback is modelled as a single server that runs one request after the other. For all to be in time, the request
+with the k-th deadline has to begin k service times before its deadline. The service time is learned from the fallback's
+own answers.
 """
 
 from __future__ import annotations
@@ -19,35 +19,35 @@ if TYPE_CHECKING:
     from sidecar.core.seam.application import RequestFailed
 
 WINDOW = 128
-"""Answers remembered, however old: the robot's processor is the same tomorrow."""
+"""Answers remembered, however old: the robot's processor will be the same tomorrow."""
 QUANTILE = 0.98
-"""So many of the requests are to be answered within what is expected; 49 answers make it known."""
+"""Share of the requests that should be answered within the expected time; known from 49 answers on."""
 SPARE_UNTIL_KNOWN = 1.5
-"""Until then: the longest time seen, times this."""
+"""Until then the expected time is the longest one seen times this."""
 
 
 class FallbackTimes:
-    """Seconds that one request took, as if it had been alone: what it waited for others is not counted."""
+    """Service times of a fallback in seconds: what a request waited for others is not counted."""
 
     __slots__ = ("_configured_s", "_free_since", "_seen_s")
 
     def __init__(self, configured_s: float | None) -> None:
-        """`configured_s`: what the user promises in place of what is measured."""
+        """Take the time that the user promises (`configured_s`), which replaces the measured one."""
         self._configured_s = configured_s
         self._seen_s: deque[float] = deque(maxlen=WINDOW)
         self._free_since = -math.inf
 
     def begun_at(self, called_at: float) -> float:
-        """When a request that was called then begins to run, if the fallback has answered those before it."""
+        """Return when a request called at that time begins to run, if the fallback has answered those before it."""
         return max(called_at, self._free_since)
 
     def note(self, called_at: float, answered_at: float) -> None:
-        """It answered."""
+        """Note an answer."""
         self._seen_s.append(answered_at - self.begun_at(called_at))
         self._free_since = answered_at
 
     def expected_s(self) -> float | None:
-        """Seconds within which it will answer; None while nothing is known."""
+        """Return the seconds within which it will answer; None while nothing is known."""
         if self._configured_s is not None:
             return self._configured_s
         if not self._seen_s:
@@ -59,16 +59,16 @@ class FallbackTimes:
 
 
 MAX_CALLED = 2
-"""Requests at one fallback at once: one runs, the next lies ready. With more, those that can still be in time would
-stand behind those that cannot."""
+"""Most requests at one fallback at once: one runs, the next is ready. With more, those that can still be in time would
+queue behind those that cannot."""
 SPARE = 0.05
-"""Share of the deadline that is left for the way to the fallback and back to the application."""
+"""Share of the deadline reserved for the way to the fallback and back to the application."""
 LEAD_UNTIL_KNOWN = 0.5
-"""Share of the deadline that a fallback is given before it has ever answered."""
+"""Share of the deadline given to a fallback that has never answered."""
 STALL_S = 1.0
 STALL_FACTOR = 4.0
-"""A fallback that is silent for so much longer than it takes, and for STALL_S, has lost what it was asked: of a process
-that crashed, DDS tells after some 20 s only."""
+"""A fallback that is silent for this many times its expected time, and for STALL_S, has lost what it was asked: DDS
+reports a crashed process only after some 20 s."""
 PLANNED_AHEAD = 64
 """Requests looked at to see when the first has to begin."""
 
@@ -82,7 +82,7 @@ class FallbackRequest:
     deadline_at: float
     expires_at: float
     wanted: bool = False
-    """Its fallback has to be asked: now, or it was."""
+    """Its fallback has to be asked now, or was asked."""
     over: bool = False
     """Its fallback will not be asked any more."""
     attempts: int = 0
@@ -90,10 +90,10 @@ class FallbackRequest:
     answered: bool = False
     """The application has its answer."""
     answered_here: bool = False
-    """From the fallback."""
+    """The application has its answer from the fallback."""
     network_over: bool = False
     failure: RequestFailed | None = None
-    """What the network said at last, kept from the application as long as the fallback may answer."""
+    """The network's failure, kept from the application as long as the fallback may answer."""
 
 
 class FallbackQueue:
@@ -107,40 +107,40 @@ class FallbackQueue:
         """An answer after the deadline is worth nothing."""
         self.times = FallbackTimes(rule.takes_s)
         self.up = False
-        """It can be asked."""
+        """The fallback can be asked."""
         self.planned: dict[RequestId, FallbackRequest] = {}
-        """The network may yet answer; in order of their deadlines, since all have the same time."""
+        """Requests that the network may yet answer, in order of their deadlines, since all have the same deadline_s."""
         self.wanted: dict[RequestId, FallbackRequest] = {}
-        """Wait for room."""
+        """Requests that wait for room."""
         self.called: dict[RequestId, FallbackRequest] = {}
-        """At the fallback."""
+        """Requests at the fallback."""
 
     def remove(self, request: FallbackRequest) -> None:
-        """It is not to be asked any more; if it was, its answer is still to come."""
+        """Remove a request that is not to be asked any more; if it was asked, its answer is still to come."""
         self.planned.pop(request.id, None)
         self.wanted.pop(request.id, None)
 
     def begin_at(self) -> float | None:
-        """When the first that is planned has to be wanted; None: not before the network has missed."""
+        """Return when the first planned request has to be wanted; None: not before the network has missed."""
         lead_s = self._lead_s()
         if not self.rule.in_time or not self.planned or lead_s is None:
             return None
-        # Those that are wanted already run first, whatever is added behind them. More than fit into one deadline cannot
-        # all be in time, however soon the first begins.
+        # Requests that are wanted already run first, whatever is added behind them. More than fit into one deadline
+        # cannot all be in time, however soon the first begins.
         fit = int((1 - SPARE) * self.deadline_s / lead_s)
         ahead = enumerate(islice(self.planned.values(), min(fit, PLANNED_AHEAD)), 1)
         latest = min(request.deadline_at - place * lead_s for place, request in ahead)
         return latest - SPARE * self.deadline_s
 
     def _lead_s(self) -> float | None:
-        """What one request takes; None: more than there is, so that to begin early would be for nothing."""
+        """Return the time one request takes; None if that is more than there is, so that beginning early is useless."""
         takes_s = self.times.expected_s()
         if takes_s is None:
             return LEAD_UNTIL_KNOWN * self.deadline_s
         return takes_s if takes_s < (1 - SPARE) * self.deadline_s else None
 
     def next_call(self, now: float) -> FallbackRequest | None:
-        """Take the request whose turn it is: of those that can be in time, or else of all, the earliest deadline."""
+        """Take the request with the earliest deadline, of those that can be in time if there are any."""
         if not self.up or len(self.called) >= MAX_CALLED or not self.wanted:
             return None
         done_at = now + (self.times.expected_s() or 0.0)
@@ -152,11 +152,11 @@ class FallbackQueue:
         return request
 
     def is_worthless(self, request: FallbackRequest, now: float) -> bool:
-        """Whether an answer to it would not be delivered any more."""
+        """Return whether an answer to it would not be delivered any more."""
         return request.answered or (self.drop_late and now >= request.deadline_at)
 
     def stalled_at(self, request: FallbackRequest) -> float:
-        """When its answer is not awaited any more, although the fallback may be there."""
+        """Return when its answer is given up, although the fallback may still be there."""
         takes_s = self.times.expected_s()
         patience_s = self.deadline_s if takes_s is None else STALL_FACTOR * takes_s
         return self.times.begun_at(request.called_at) + max(STALL_S, patience_s)

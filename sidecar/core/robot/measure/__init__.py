@@ -1,1 +1,1 @@
-"""What the robot measures and reports. Imports `robot.request`."""
+"""Measures and reports for the robot. Imports `robot.request`."""

@@ -1,4 +1,4 @@
-"""What the robot measured since its last report to the control plane."""
+"""Collects what the robot measured since its last report to the control plane."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from sidecar.core.transfer.routes import Routes
 
 MAX_ANSWER_SIZES = 1024
-"""Services whose usual size of an answer is kept: as many as a robot can carry."""
+"""Services whose latest answer size is kept: as many as a robot can carry."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,7 +42,7 @@ class InterfacePair:
     service: ServiceName
     first: InterfaceName
     second: InterfaceName
-    """After the first in the order of their names."""
+    """The interface whose name sorts after `first`."""
     server: NodeName | None
 
 
@@ -53,11 +53,11 @@ class PairOutcome:
     first_missed: bool
     second_missed: bool
     raced: bool
-    """It was chosen to be a full race. Else that one missed alone means nothing: the copy may have been called off."""
+    """It was a full race. Otherwise a miss of one alone means nothing: the copy may have been called off."""
 
 
 class JointCounts:
-    """Of all requests over two interfaces since the last report."""
+    """Counts of all requests over two interfaces since the last report."""
 
     __slots__ = ("both_missed", "only_first_missed", "only_second_missed", "races", "requests")
 
@@ -74,7 +74,7 @@ class JointCounts:
             self.only_second_missed += outcome.second_missed and not outcome.first_missed
 
     def report(self, pair: InterfacePair) -> InterfaceJointReport:
-        """What the control plane is told."""
+        """Return the report for the control plane."""
         return InterfaceJointReport(
             pair.service,
             pair.first,
@@ -110,29 +110,29 @@ class _PathCounts:
 
 class Measurements:
     """Times and missed deadlines per (interface, server, service, size class), round-trip times per path, outcomes per
-    service and, joint ones, per pair of paths and per pair of interfaces."""
+    service, and joint outcomes per pair of paths and per pair of interfaces."""
 
     def __init__(self, dropped: Counter[str]) -> None:
         self._dropped = dropped
-        """Counts what a report has no room for."""
+        """Counters of what a report has no room for."""
         self._answer_bytes: dict[ServiceName, int] = {}
         self._next_path = 0
-        """Which path is told of first, where one report does not hold all."""
+        """Index of the first path to report, where one report does not hold all."""
         self._changed: dict[tuple[InterfaceName, NodeName], None] = {}
-        """Whose paths went up or down since the last report."""
+        """Pairs whose paths went up or down since the last report."""
         self._missed = False
         """Whether a deadline was missed since the last whole report."""
         self._told: ReportScope | None = None
-        """What was asked to be told at once since the last report."""
+        """Scope of the early report asked for since the last one."""
         self._clear()
 
     def note_path_change(self, path: PathId) -> None:
-        """A path went up or down."""
+        """Note that a path went up or down."""
         if len(self._changed) < MAX_PATHS:
             self._changed[path.interface, path.peer] = None
 
     def take_urgency(self) -> ReportScope | None:
-        """What should be told before the next report is due, if that is more than was said since the last one."""
+        """Return what to report before the next report is due, unless that was asked for since the last one."""
         wanted = ReportScope.ALL if self._missed else ReportScope.CHANGES if self._changed else None
         if wanted is None or self._told in (wanted, ReportScope.ALL):
             return None
@@ -148,11 +148,11 @@ class Measurements:
         self._interfaces: dict[InterfacePair, JointCounts] = {}
 
     def size_class(self, service: ServiceName, request_bytes: int) -> int:
-        """The class of a request before its answer is known: the service's latest one stands for it."""
+        """Return the class of a request before its answer is known: the service's latest answer stands for it."""
         return size_class(request_bytes + self._answer_bytes.get(service, 0))
 
     def answered(self, carried: Carried, latency_s: float, processing_s: float, answer_bytes: int) -> None:
-        """One copy was answered `latency_s` after it was sent, of which the server worked for `processing_s`."""
+        """Record a copy that was answered `latency_s` after it was sent; the server took `processing_s` of that."""
         if carried.service in self._answer_bytes or len(self._answer_bytes) < MAX_ANSWER_SIZES:
             self._answer_bytes[carried.service] = answer_bytes
         counts = self._of(carried)
@@ -161,19 +161,19 @@ class Measurements:
             counts.processing.record(processing_s)
 
     def called_off(self, carried: Carried, after_s: float) -> None:
-        """One copy that its server did not have yet was called off `after_s` after it was sent."""
+        """Record a copy that was called off `after_s` after it was sent, before its server had it."""
         counts = self._of(carried)
         if counts is not None:
             counts.called_off.record(after_s)
 
     def lost(self, carried: Carried, *, delivered: bool) -> None:
-        """One copy was never answered: by the server, if it was `delivered`, else for the network's sake."""
+        """Record a copy that was never answered: because of the server if it was `delivered`, else of the network."""
         counts = self._of(carried)
         if counts is not None:
             (counts.processing if delivered else counts.network).record_lost()
 
     def judged(self, carried: Carried, *, missed: bool) -> None:
-        """Whether a copy missed the deadline is known."""
+        """Record whether a copy missed the deadline."""
         counts = self._of(carried)
         if counts is not None:
             counts.requests += 1
@@ -189,7 +189,7 @@ class Measurements:
         return counts
 
     def path(self, event: PathMeasured) -> None:
-        """A link measured a path."""
+        """Record a link's measurement of a path."""
         counts = self._paths.setdefault(event.path, _PathCounts())
         for rtt in event.rtts_s:
             counts.rtt.record(rtt)
@@ -197,14 +197,14 @@ class Measurements:
         counts.lost += event.lost
 
     def outcome(self, service: ServiceName, outcome: str) -> None:
-        """A request ended; a missed deadline may mean that the mapping is wrong."""
+        """Record a request's outcome; a missed deadline may mean that the mapping is wrong."""
         self._missed |= outcome == "deadline_missed"
         self._outcomes[service, outcome] += 1
 
     def judged_together(
         self, service: ServiceName, first: Assignment, second: Assignment, *, both_missed: bool
     ) -> None:
-        """Whether two copies of a request both missed is known."""
+        """Record whether two copies of a request both missed."""
         key = (service, first, second)
         if key not in self._compared and len(self._compared) >= MAX_JOINTS:
             self._dropped["joint_outcomes_full"] += 1
@@ -213,7 +213,7 @@ class Measurements:
         self._both_missed[key] += both_missed
 
     def judged_interfaces(self, pair: InterfacePair, outcome: PairOutcome) -> None:
-        """Whether a request missed over two interfaces is known."""
+        """Record whether a request missed over each of two interfaces."""
         counts = self._interfaces.get(pair)
         if counts is None:
             if len(self._interfaces) >= MAX_JOINTS:
@@ -223,7 +223,7 @@ class Measurements:
         counts.add(outcome)
 
     def take(self, routes: Routes, servers: list[NodeName]) -> Report:
-        """Return everything since the last call, and the state of every path to these servers there is room for."""
+        """Return everything since the last call, and the state of as many paths to these servers as fit."""
         latencies = tuple(
             LatencyReport(*carried, of.network, of.called_off, of.processing, of.requests, of.missed)
             for carried, of in sorted(self._carried.items(), key=itemgetter(0))
@@ -262,7 +262,7 @@ class Measurements:
         return Report(paths=paths, changes_only=True)
 
     def _in_turn(self, paths: list[tuple[InterfaceName, NodeName]]) -> list[tuple[InterfaceName, NodeName]]:
-        """As many as one report holds, from where the last one ended: all are told of, if not always."""
+        """Return as many paths as one report holds, from where the last one ended, so that all have their turn."""
         left_out = len(paths) - MAX_PATHS
         if left_out <= 0:
             return paths
@@ -272,7 +272,7 @@ class Measurements:
         return (paths[first:] + paths[:first])[:MAX_PATHS]
 
     def _path_report(self, interface: InterfaceName, server: NodeName, routes: Routes) -> PathReport:
-        """One report for all paths between the two: the mapping knows interfaces and servers only."""
+        """Return one report for all paths between the two: the mapping knows interfaces and servers only."""
         total = _PathCounts()
         up = False
         for route in routes.all_to(server):

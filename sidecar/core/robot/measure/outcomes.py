@@ -1,16 +1,16 @@
 """Counts which copies of a request missed its deadline: each by itself, and two together.
 
-To be free of bias, which requests count is settled when they are sent, without regard to their outcome. A full race
-counts for each of its copies and for every pair of them. A request with two copies to two servers always counts for the
-pair: how long a called-off loser would have taken is unknown, but not both have missed. With more copies, or a single
-server (which may be hedged), that is known only by chance. Copies sent later, in trouble, started late and count for
-nothing; if one of them won, the paths of those before it were not up, and they count as missed. What a server refused
-says nothing of paths.
+To avoid bias, which requests count is settled when they are sent, regardless of their outcome. A full race counts for
+each of its copies and for every pair of them. A request with two copies to two servers always counts for the pair: how
+long a called-off loser would have taken is unknown, but not both have missed. With more copies, or a single server
+(which may be hedged), that is known only by chance. Copies sent later, in trouble, started late and do not count; if
+one of them won, the paths of those before it were not up, and they count as missed. A copy that a server refused tells
+nothing about paths.
 
-Paths that are down carry no copy, so no copy tells of them. Two interfaces without any path at once probably share what
-failed. So an interface over which no path was up when the request came counts as missed, unless a copy was answered
-over it in time after all. Services that do not send over every interface are an exception: such requests would count
-only while something is down.
+Paths that are down carry no copy, so no copy measures them. Two interfaces that have no path at the same time probably
+share what failed. So an interface over which no path was up when the request came counts as missed, unless a copy was
+answered over it in time after all. Services that do not send over every interface are an exception: such requests would
+count only while something is down.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 
 
 def interface_outcomes(request: Request) -> Iterator[tuple[InterfacePair, PairOutcome]]:
-    """What a request tells whose deadline is over, or whose copies have all ended."""
+    """Yield the outcomes per pair of interfaces of a request whose deadline is over or whose copies have all ended."""
     missed: dict[InterfaceName, bool] = {}
     servers: dict[InterfaceName, NodeName] = {}
     for copy in request.started_together():
@@ -56,7 +56,7 @@ def interface_outcomes(request: Request) -> Iterator[tuple[InterfacePair, PairOu
 
 
 def measure_outcomes(request: Request, measurements: Measurements) -> None:
-    """Count, once, what missed: when the deadline is over or every copy has ended."""
+    """Count what missed, once, when the deadline is over or every copy has ended."""
     if request.outcomes_measured:
         return
     request.outcomes_measured = True

@@ -1,1 +1,1 @@
-"""One request and its copies, and what decides where they may go. The lowest of the robot's packages."""
+"""Holds one request and its copies, and decides where they may go. The lowest of the robot's packages."""

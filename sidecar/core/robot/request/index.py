@@ -1,4 +1,4 @@
-"""Robot side: the requests in flight, found by whatever an event names: one of thousands must not be looked for."""
+"""Robot side: finds the requests in flight by whatever an event names, without a search through thousands."""
 
 from __future__ import annotations
 
@@ -37,24 +37,24 @@ class RequestIndex:
         return self._by_id.get(request_id)
 
     def add(self, request: Request) -> None:
-        """A request came."""
+        """Add a request; it is stranded until its first copy."""
         self._by_id[request.id] = request
         self._by_service.setdefault(request.service, {})[request.id] = request
         self._stranded[request.id] = request
 
     def add_copy(self, request: Request, copy: Copy) -> None:
-        """A copy of the request was sent; it is the last one of `request.copies`."""
+        """Add a copy that was sent; it is the last one of `request.copies`."""
         self._stranded.pop(request.id, None)
         self._by_path.setdefault(copy.path, {})[request.id] = request
         numbered = request.id, len(request.copies) - 1
         self._by_server.setdefault(copy.path.peer, {})[numbered] = request, copy
 
     def strand(self, request: Request) -> None:
-        """None of the request's copies may be answered any more."""
+        """Note that none of the request's copies may be answered any more."""
         self._stranded[request.id] = request
 
     def remove(self, request: Request) -> None:
-        """All copies of the request have come to an end."""
+        """Remove a request whose copies have all ended."""
         if self._by_id.pop(request.id, None) is None:
             return
         self._stranded.pop(request.id, None)
@@ -72,7 +72,7 @@ class RequestIndex:
         return list(self._by_service.get(service, {}).values())
 
     def stranded(self) -> list[Request]:
-        """Return the requests of which no copy is under way, the longest stranded first."""
+        """Return the requests that have no copy under way, the longest stranded first."""
         return list(self._stranded.values())
 
     def paths(self) -> list[PathId]:
@@ -80,15 +80,15 @@ class RequestIndex:
         return list(self._by_path)
 
     def uses(self, path: PathId) -> bool:
-        """Whether a copy was sent over this path, of a request in flight."""
+        """Return whether a copy of a request in flight was sent over this path."""
         return path in self._by_path
 
     def over(self, path: PathId) -> list[Request]:
-        """Return the requests of which a copy was sent over this path."""
+        """Return the requests that had a copy sent over this path."""
         return list(self._by_path.get(path, {}).values())
 
     def take_copies_at(self, server: NodeName) -> list[tuple[Request, Copy]]:
-        """Return all copies that were sent to a server, and forget that: its session is over."""
+        """Return all copies sent to a server whose session is over, and forget that they were sent there."""
         return list(self._by_server.pop(server, {}).values())
 
 

@@ -1,8 +1,8 @@
-"""Which paths a request takes: the control plane's mapping, and what the sidecar does where it does not hold.
+"""Chooses the paths of a request: by the control plane's mapping, and by the sidecar itself where that does not hold.
 
-The mapping says which interface goes to which server (paper, section IV.A). Between two mappings a path may die:
-then the interface takes another live server, and with no mapping at all (or none of its paths alive) the sidecar
-assigns by round-trip time itself. A request never waits for the control plane.
+The mapping says which interface goes to which server (paper, section IV.A). If a path dies between two mappings, the
+interface takes another live server. With no mapping at all (or none of its paths alive) the sidecar assigns by
+round-trip time itself. A request never waits for the control plane.
 """
 
 from __future__ import annotations
@@ -31,13 +31,13 @@ class MappingTable:
 
     @property
     def services(self) -> Mapping[ServiceName, ServiceMapping]:
-        """The mapping in force."""
+        """Return the mapping in force."""
         return self._services
 
     def apply(
         self, mapping: MappingSet, interfaces: Collection[InterfaceName], servers: Collection[NodeName]
     ) -> str | None:
-        """Put a mapping in force; returns what is wrong with it (and keeps the old one) or None."""
+        """Put a mapping in force. Return None, or what is wrong with it, in which case the old one stays."""
         for service in mapping.services:
             for assignment in (*service.assignments, *((service.explore,) if service.explore else ())):
                 if assignment.interface not in interfaces:
@@ -49,10 +49,10 @@ class MappingTable:
         return None
 
     def choose(self, service: ServiceName, servers: Collection[NodeName], *, idempotent: bool) -> tuple[PathId, ...]:
-        """Return the paths for a new request's copies; empty when nothing reaches any of the `servers`.
+        """Return the paths for a new request's copies; empty when no path reaches any of the `servers`.
 
-        `servers` are the live ones that offer the service. Requests that are not idempotent get one server only
-        (over every interface that reaches it: the server runs them once, `executions.py`).
+        `servers` are the live ones that offer the service. Requests that are not idempotent get one server only,
+        over every interface that reaches it: the server runs them once (`executions.py`).
         """
         chosen = self._mapped(service, servers)
         if not any(route.state is PathState.UP for route in chosen):
@@ -76,7 +76,7 @@ class MappingTable:
         return chosen
 
     def _by_round_trip_time(self, servers: Collection[NodeName]) -> list[Route]:
-        """Each interface takes its fastest server, another than the others' where there is one."""
+        """Give each interface its fastest server, a different one from the other interfaces' if possible."""
         chosen: dict[InterfaceName, Route] = {}
         taken: set[NodeName] = set()
         routes = self._routes.usable(servers)
@@ -91,7 +91,7 @@ class MappingTable:
         return first + [route for route in more if route not in first]
 
     def _over_every_interface(self, routes: list[Route]) -> list[Route]:
-        """Keep one server, and reach it over each of the interfaces that were to reach one."""
+        """Keep one server, and reach it over each of the interfaces in `routes`."""
         if not routes:
             return routes
         server = next((route for route in routes if route.state is PathState.UP), routes[0]).id.peer
@@ -100,6 +100,6 @@ class MappingTable:
         return [route for route in over if route is not None]
 
     def rescue(self, servers: Collection[NodeName]) -> PathId | None:
-        """Return the best path to any of these servers that is up, for a request whose copies are in trouble."""
+        """Return the best path that is up to any of these servers, for a request whose copies are in trouble."""
         routes = self._routes.usable(servers)
         return routes[0].id if routes and routes[0].state is PathState.UP else None

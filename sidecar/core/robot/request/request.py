@@ -1,4 +1,4 @@
-"""Robot side: one request in flight and its copies."""
+"""Robot side: holds one request in flight and its copies."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from sidecar.core.rules.service_rule import ServiceRule
 
 HEDGE_AT = 0.5
-"""At this part of the deadline, a server that has the request alone and is silent makes another one worth asking."""
+"""Share of the deadline after which another server is worth asking if the only one with the request is silent."""
 
 
 class Carried(NamedTuple):
@@ -28,13 +28,13 @@ class Carried(NamedTuple):
 
 
 class Answer(NamedTuple):
-    """What is known of a copy's answer besides what it says."""
+    """What is known about a copy's answer besides its content."""
 
     size: int
     processing_s: float
     at: float
     measured: bool
-    """It tells of its path."""
+    """Whether it counts as a measurement of its path."""
 
 
 class CopyState(enum.Enum):
@@ -43,7 +43,7 @@ class CopyState(enum.Enum):
     PENDING = "pending"
     ANSWERED = "answered"
     REJECTED = "rejected"
-    """It was refused, or its answer can not be delivered."""
+    """It was refused, or its answer cannot be delivered."""
     DEAD = "dead"
     """Its server's session ended, or it was called off or taken back."""
 
@@ -57,32 +57,32 @@ class Copy:
     message: OutboundMessage
     state: CopyState = CopyState.PENDING
     certainly_not_run: bool = False
-    """It was refused unrun, or nothing of it left before it was dead."""
+    """It was refused without being run, or nothing of it left before it was dead."""
     in_time: bool = False
     """It was answered before the deadline."""
     session_over: bool = False
-    """Its server's session ended since: whoever comes back under that name knows nothing of it."""
+    """Its server's session has ended: a server that comes back under that name does not know the copy."""
     answer: Answer | None = None
-    """Which the application judges at present."""
+    """The answer that the application is judging."""
     ended_at: float | None = None
     """When it was answered or called off."""
     explores: bool = False
-    """It was sent to learn, over a path that is not used otherwise: nothing relies on it."""
+    """It was sent to explore a path that is not used otherwise: nothing relies on it."""
     hedges: bool = False
-    """It was sent since another one took long. It says of its path how it is then only, and is not measured."""
+    """It was sent because another one took long. It shows its path at such a moment only, and is not measured."""
     forecast_s: float | None = None
     """How long its answer was expected to take when it was sent."""
     arrived: int = 0
-    """Symbols of it known to have arrived when it was last looked at ..."""
+    """Number of its symbols known to have arrived when it was last looked at ..."""
     progress_at: float = field(init=False)
-    """... and when that was first seen."""
+    """... and when that number was first seen."""
 
     def __post_init__(self) -> None:
         self.progress_at = self.sent_at
 
     @property
     def refused(self) -> bool:
-        """Whether its server would refuse it again."""
+        """Return whether its server would refuse it again."""
         return self.state is CopyState.REJECTED and not self.session_over
 
 
@@ -97,16 +97,16 @@ class Request:
     payload: bytes | None
     submitted_at: float
     size_class: int = 0
-    """Settled when it was submitted (`protos.base.size_class`)."""
+    """Size class, fixed when it was submitted (`protos.base.size_class`)."""
     size: int = 0
-    """Bytes of the message that a copy of it is, settled when it was submitted."""
+    """Bytes of a copy's message, fixed when it was submitted."""
     held: int = field(init=False)
     """Bytes of its payload, which stay in memory until its last copy has ended."""
     copies: list[Copy] = field(default_factory=list)
     messages: list[OutboundMessage] = field(default_factory=list)
-    """What carries those copies that may leave it to each other: siblings."""
+    """Messages of the copies that may leave the request to each other: siblings."""
     withheld: tuple[PathId, ...] = ()
-    """Further paths that its mapping names, the best first: for trouble, or to learn of them."""
+    """Further paths that its mapping names, the best first: for trouble, or to explore."""
     dark: tuple[InterfaceName, ...] = ()
     """Interfaces over which no path to any of its servers was up when it was submitted."""
     observed: bool = True
@@ -115,17 +115,17 @@ class Request:
     """The application got its response, or the request failed."""
     missed: bool = False
     answered_here: bool = False
-    """The application has its answer, not from the network: copies are sent no more, and are awaited until the deadline
-    for what they tell of their paths."""
+    """The application got its answer on the robot. No more copies are sent; those under way are awaited until the
+    deadline for what they tell about their paths."""
     judged: int = 0
-    """How many answers the application judges at present."""
+    """Number of answers that the application is judging."""
     found_unreachable: bool = False
     retry_at: float | None = None
-    """When servers that refused it for the moment are asked again (s); None: not at all."""
+    """When servers that refused it for the moment are asked again (s); None: never."""
     refusal: str = ""
     """Why the last of them refused it."""
     outcomes_measured: bool = False
-    """Which of its copies missed the deadline has been counted."""
+    """The copies that missed the deadline have been counted."""
 
     def __post_init__(self) -> None:
         self.held = len(self.payload or b"")
@@ -140,41 +140,41 @@ class Request:
 
     @property
     def is_answered(self) -> bool:
-        """Whether the application has an answer, or looks at one: no copy is sent any more meanwhile."""
+        """Return whether the application has an answer or is judging one: meanwhile no copy is sent."""
         return self.answered_here or self.judged > 0
 
     def pending(self) -> list[Copy]:
         return [copy for copy in self.copies if copy.state is CopyState.PENDING]
 
     def relied_on(self) -> list[Copy]:
-        """Pending copies but those that explore."""
+        """Return the pending copies except those that explore."""
         return [copy for copy in self.pending() if not copy.explores]
 
     def asked(self) -> set[NodeName]:
-        """The servers of all copies but those that explore."""
+        """Return the servers of all copies except those that explore."""
         return {copy.path.peer for copy in self.copies if not copy.explores}
 
     def carried(self, copy: Copy) -> Carried:
-        """What a measurement of the copy is one of."""
+        """Return the group in which the copy is measured."""
         return Carried(copy.path.interface, copy.path.peer, self.service, self.size_class)
 
     def waits_for_one_server(self) -> bool:
-        """Whether a single server was asked, holds the request, and has not answered."""
+        """Return whether a single server was asked, holds the request, and has not answered."""
         return len(self.asked()) == 1 and any(copy.message.newest.over for copy in self.relied_on())
 
     def certainly_not_run(self) -> bool:
-        """Whether no server has run it, nor will."""
+        """Return whether no server has run it or will run it."""
         return all(copy.certainly_not_run for copy in self.copies)
 
     def may_be_sent(self) -> bool:
-        """Whether no copy of it may be answered any more, and another one does no harm."""
+        """Return whether no copy of it may be answered any more, and another one does no harm."""
         return not (self.done or self.judged or self.pending()) and (self.rule.idempotent or self.certainly_not_run())
 
     def worth_another_copy(self, servers: tuple[NodeName, ...], *, rejected: bool) -> tuple[NodeName, ...]:
         """Return those of `servers` that have no pending copy and refused none.
 
-        When all else is lost and this is not about a refusal (`rejected`): those that could not run it (starting,
-        draining, full) and may do so now.
+        If there are none and this is not about a refusal (`rejected`), return those that could not run it (starting,
+        draining, full) and may be able to now.
         """
         busy = {copy.path.peer for copy in self.relied_on()}
         refused = {copy.path.peer for copy in self.copies if copy.refused}
@@ -188,15 +188,15 @@ class Request:
     def choose_observation(self) -> None:
         """Decide, when the first copies go out, whether this request is a full race.
 
-        A single copy has nobody to lose against, unless it may be hedged.
+        A single copy has nothing to lose against, unless it may be hedged.
         """
         hedged = self.rule.redundancy.sends_late
         self.observed = (len(self.copies) < 2 and not hedged) or self.is_race()
 
     def started_together(self) -> list[Copy]:
-        """The copies sent when the request came, or when there was a path at last."""
+        """Return the copies sent when the request came, or when there was a path at last."""
         return [copy for copy in self.copies if copy.sent_at == self.copies[0].sent_at and not copy.hedges]
 
     def is_race(self) -> bool:
-        """Whether all its copies are to be measured."""
+        """Return whether all its copies are to be measured."""
         return is_race(self.id)

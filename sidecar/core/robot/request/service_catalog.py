@@ -1,9 +1,9 @@
-"""Robot side: which services exist on the robot, following the live servers.
+"""Robot side: decides which services exist on the robot, following the live servers.
 
-A service is offered from its first server within reach on. When there is none any more, as all paths are dark or as the
-servers themselves are gone, the offer stays for WITHDRAW_AFTER_S, or for the lifetime of a request where that is
-longer: they may be in a tunnel or restarting, and requests wait for the first that comes back. With the offer end the
-requests that still wait at it.
+A service is offered once its first server is within reach. When none is left, because all paths are dark or the servers
+themselves are gone, the offer stays for WITHDRAW_AFTER_S, or for the lifetime of a request if that is longer: the robot
+may be in a tunnel or the servers restarting, and requests wait for the first that comes back. When the offer ends, so
+do the requests that still wait at it.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from sidecar.core.transfer.routes import Routes
 
 MAX_TYPES = 2048
-"""Services whose type in use is remembered, the one noted longest ago goes: peers invent names under a glob."""
+"""Services whose type is remembered; beyond that the one noted longest ago goes. Peers invent names under a glob."""
 
 MAX_OFFERED = 512
 """Services offered on the robot; each costs DDS endpoints and a slot in every wait. One peer may have half."""
@@ -37,41 +37,41 @@ class Offers:
     """Services offered on the robot, and the servers behind each."""
 
     def __init__(self, rules: Rules, stats: EngineStats, *, budgeted: bool = False) -> None:
-        """`budgeted`: budgets limit extra copies, which the control plane is told."""
+        """Take the rules; `budgeted` (budgets limit extra copies) is reported to the control plane."""
         self._rules = rules
         self._budgeted = budgeted
         self._stats = stats
         self._offered: dict[ServiceName, str] = {}
         self._shares = Shares(MAX_OFFERED)
         self._charged: dict[ServiceName, NodeName] = {}
-        """In whose share each offered service is: one of its servers then."""
+        """Offered service -> the peer whose share it counts in: one of its servers when it was offered."""
         self._refused: set[ServiceName] = set()
-        """Wanted, and without room at the last look."""
+        """Wanted services that had no room at the last look."""
         self._types: OrderedDict[ServiceName, str] = OrderedDict()
-        """The type of each service that was offered last, in this run or the one before."""
+        """The type with which each service was last offered, in this run or an earlier one."""
         self._by_peer: dict[NodeName, tuple[dict[ServiceName, str], bool]] = {}
         """Peer -> (the type of each service that it offers, whether it drains)."""
         self._by_service: dict[ServiceName, dict[str, dict[NodeName, bool]]] = {}
-        """Service -> type -> who offers it so, and whether they drain."""
+        """Service -> type -> the peers that offer it with that type, and whether they drain."""
         self._touched: set[ServiceName] = set()
-        """Services of which other servers than before, or of another type, are known."""
+        """Services whose servers, or whose servers' types, have changed."""
         self._wanted: dict[ServiceName, tuple[str, tuple[NodeName, ...]]] = {}
         """Service -> (type, servers), as the peers offer it."""
         self._gained: set[ServiceName] = set()
-        """Of the wanted ones, those that got another server since somebody asked."""
+        """Wanted services that got another server since the last `take_gained`."""
         self._dark_until: dict[ServiceName, float] = {}
         """Service without a server in reach -> when its offer ends."""
         self._conflicts: dict[ServiceName, set[tuple[ServiceName, NodeName, str]]] = {}
 
     @property
     def offered(self) -> dict[ServiceName, str]:
-        """Service names and types offered now."""
+        """Return the names and types of the services offered now."""
         return self._offered
 
     @property
     def unreached(self) -> dict[ServiceName, int]:
-        """Services that peers offer as the configuration wants them, and that are not offered here, as no path leads to
-        one of those peers; and how many these are."""
+        """Return the services that peers offer as the configuration wants them but that are not offered here because no
+        path leads to any of those peers, each with the number of those peers."""
         self._choose_touched()
         return {
             name: len(servers)
@@ -81,7 +81,7 @@ class Offers:
 
     @property
     def conflicts(self) -> set[tuple[ServiceName, NodeName, str]]:
-        """Servers left out because they offer another type than the configuration's, or than the rest."""
+        """Return the servers left out because their type differs from the configuration's or the other servers'."""
         self._choose_touched()
         return {conflict for of_service in self._conflicts.values() for conflict in of_service}
 
@@ -94,7 +94,7 @@ class Offers:
         return wanted[1] if wanted else ()
 
     def update(self, routes: Routes, now: float) -> list[OfferService | WithdrawService]:
-        """Follow the peers' offers and the paths to them; returns what changes on the robot."""
+        """Follow the peers' offers and the paths to them; return what changes on the robot."""
         self._choose_touched()
         reached = {name: kind for name, (kind, servers) in self._wanted.items() if routes.reaches_any(servers)}
         events: list[OfferService | WithdrawService] = []
@@ -126,9 +126,9 @@ class Offers:
         return events
 
     def _charge(self, name: ServiceName, full: set[NodeName]) -> bool:
-        """Take the service into the share of one of its servers that has room; `full` are those that had none.
+        """Count the service in the share of one of its servers that has room; `full` are those that had none.
 
-        Servers take turns: looking for the one with the smallest share costs a look at each for each service.
+        Servers take turns: finding the one with the smallest share would cost a look at each for each service.
         """
         servers = self._wanted[name][1]
         first = len(self._offered) % len(servers)
@@ -153,9 +153,9 @@ class Offers:
         return max(WITHDRAW_AFTER_S, rule.lifetime_s) if rule else WITHDRAW_AFTER_S
 
     def uses(self, carried: Mapping[ServiceName, bool | None]) -> tuple[ServiceUse, ...]:
-        """Return the offered services of these, as the control plane is told of them.
+        """Return those of these services that are offered, as reported to the control plane.
 
-        `carried` tells whether their fallbacks can be asked.
+        `carried` says whether their fallbacks can be asked.
         """
         uses = []
         for name, kind in self._offered.items():
@@ -179,11 +179,11 @@ class Offers:
         return tuple(uses)
 
     def knows_type(self, name: ServiceName) -> bool:
-        """Whether it is known which type the service had last."""
+        """Return whether the service's last type is known."""
         return name in self._types
 
     def remember_type(self, name: ServiceName, kind: str) -> None:
-        """An earlier run used this type."""
+        """Remember the type that an earlier run used."""
         if name not in self._types:
             self._note_type(name, kind)
             self._touched.add(name)
@@ -196,7 +196,7 @@ class Offers:
             self._stats.dropped["type_forgotten"] += 1
 
     def set_peer(self, peer: Peer) -> None:
-        """Take what a peer offers; `update` tells what comes of it."""
+        """Take what a peer offers; `update` returns what changes."""
         offers = {offer.name: offer.type for offer in peer.offers if self._rules.find(offer.name) is not None}
         before, drained = self._by_peer.get(peer.name, ({}, False))
         if offers == before and drained == peer.draining:
@@ -211,11 +211,11 @@ class Offers:
                 self._touched.add(name)
 
     def others(self, peers: Container[NodeName]) -> list[NodeName]:
-        """Return the peers known here that are none of these."""
+        """Return the peers known here that are not among these."""
         return [name for name in self._by_peer if name not in peers]
 
     def forget_peer(self, peer: NodeName) -> None:
-        """The peer is gone."""
+        """Forget a peer that is gone."""
         offers, _ = self._by_peer.pop(peer, ({}, False))
         for name, kind in offers.items():
             self._take_out(name, kind, peer)
@@ -234,7 +234,7 @@ class Offers:
             self._choose(self._touched.pop())
 
     def _choose(self, name: ServiceName) -> None:
-        """Settle the service's type and servers; servers that drain count only where there is no other."""
+        """Settle the service's type and servers; draining servers count only if there is no other."""
         by_type = self._by_service.get(name)
         before = self._wanted.pop(name, None)
         self._conflicts.pop(name, None)
@@ -245,7 +245,7 @@ class Offers:
         kind = rule.type if rule is not None else ""
         if not kind:
             last = self._types.get(name)
-            # Most servers win; the type used last wins a tie, so that one odd server changes nothing.
+            # The type with most servers wins. The last type wins a tie, so that one odd server changes nothing.
             kind = max(sorted(by_type), key=lambda kind: (len(by_type[kind]), kind == last))
         odd = {(name, peer, other) for other, peers in by_type.items() if other != kind for peer in peers}
         if odd:
@@ -266,5 +266,5 @@ class Offers:
         return gained
 
     def next_timer(self) -> float | None:
-        """When the first darkness ends an offer."""
+        """Return when the first darkness ends an offer."""
         return min(self._dark_until.values(), default=None)
