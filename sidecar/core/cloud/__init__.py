@@ -1,4 +1,4 @@
-"""The cloud's role: executions, each once, and their answers.
+"""Plays the cloud's role: executes each request once and delivers the answers.
 
 Imports `base`, `wire`, `seam`, `rules` and `transfer`.
 """

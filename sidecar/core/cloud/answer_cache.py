@@ -1,6 +1,6 @@
-"""Cloud side: which answers are kept for copies that come late, within a number of bytes.
+"""Cloud side: decides which answers are kept for copies that come late, within a number of bytes.
 
-When they are too many, the oldest goes of the robot that holds the most bytes: who asks for much pushes out its own.
+When there are too many, the robot that holds the most bytes loses its oldest answer: a greedy robot evicts its own.
 """
 
 from __future__ import annotations
@@ -19,16 +19,16 @@ class AnswerCache:
     __slots__ = ("_bytes", "_capacity", "_sizes", "held_bytes")
 
     def __init__(self, capacity: int) -> None:
-        """`capacity`: bytes."""
+        """Start empty; `capacity` is in bytes."""
         self._capacity = capacity
-        # Ordered for cheap removal of the oldest: a dict walks over the holes at its front.
+        # An OrderedDict removes the oldest cheaply: a dict walks over the holes at its front.
         self._sizes: dict[NodeName, OrderedDict[RequestId, int]] = {}
         self._bytes: dict[NodeName, int] = {}
         self.held_bytes = 0
-        """Of all robots."""
+        """Bytes held for all robots."""
 
     def add(self, robot: NodeName, request_id: RequestId, size: int) -> list[tuple[NodeName, RequestId]]:
-        """Keep an answer of `size` bytes; return those to drop for it, maybe itself."""
+        """Keep an answer of `size` bytes; return the answers to drop for it, possibly itself."""
         self._sizes.setdefault(robot, OrderedDict())[request_id] = size
         self._bytes[robot] = self._bytes.get(robot, 0) + size
         self.held_bytes += size
@@ -41,7 +41,7 @@ class AnswerCache:
         return evicted
 
     def remove(self, robot: NodeName, request_id: RequestId) -> None:
-        """Keep this one no longer, if it is kept."""
+        """Stop keeping this answer, if it is kept."""
         sizes = self._sizes.get(robot)
         if sizes is None or request_id not in sizes:
             return

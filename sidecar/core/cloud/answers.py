@@ -1,10 +1,10 @@
-"""Cloud side: answers from the moment they are known until they are delivered, or nobody waits for them any more.
+"""Cloud side: holds answers until they are delivered or nobody waits for them any more.
 
 An answer that finds no room to be sent waits for it. Each robot has lines of its own, one for each lane (`room.py`), so
-none holds up another. Several copies that asked share the answer's bytes here, but each travels apart: the answer goes
-over one path first, and to the other copies when no answer waits for its first.
+none holds up another. Several copies that asked share the answer's bytes here, but each is sent separately: the answer
+goes over one path first, and to the other copies when no answer waits for its first sending.
 
-What came of a request must not vanish: an answer that has no room to wait either, or that has not begun to leave when
+The outcome of a request must not vanish: an answer that has no room to wait either, or that has not begun to leave when
 its time is nearly over, is replaced by a rejection that says so.
 """
 
@@ -41,17 +41,17 @@ if TYPE_CHECKING:
     from sidecar.core.transfer.routes import Routes
 
 MAX_ANSWERS = 32_768
-"""Answers and rejections that wait or are under way; one robot may have half: twice what it may have in flight."""
+"""Most answers and rejections waiting or under way; one robot may have half: twice what it may have in flight."""
 MAX_ANSWER_BYTES = 512 * 1024 * 1024
-"""Payloads of those answers, as much as those of the requests that run; one robot may hold half."""
+"""Most payload bytes of those answers, as many as of the requests that run; one robot may hold half."""
 TELL_BEFORE = 0.1
-"""An answer of which nothing has left when this part of its time remains ..."""
+"""An answer of which nothing has left when this share of its time remains ..."""
 TELL_BEFORE_S = 1.0
-"""... but no more than this, is given up: the robot has time to learn it, and maybe to ask elsewhere."""
+"""... but no more than this (s), is given up: the robot has time to learn it, and perhaps to ask elsewhere."""
 ROBOTS_AT_ONCE = 16
-"""Robots whose lines are looked at when a message ends, besides its own: the number of messages is shared by all."""
+"""Further robots whose lines are looked at when a message ends: the limit on messages is shared by all robots."""
 TIMER_SLACK = 1024
-"""Timers of answers that are over that may lie around before they are swept out."""
+"""Timers of finished answers allowed to remain before they are swept out."""
 
 
 @dataclass(slots=True, eq=False)
@@ -60,15 +60,15 @@ class _Answer:
 
     number: int
     reply: Reply
-    """To the first copy that asked."""
+    """The reply to the first copy that asked."""
     size: int
-    """Bytes of one message of it."""
+    """Bytes of one message that carries it."""
     waiting: dict[int, PathId] = field(default_factory=dict)
-    """Copies it was not sent to yet, and how they came."""
+    """Copies it was not sent to yet, and the paths they came by."""
     sent: dict[int, PathId] = field(default_factory=dict)
-    """Copies it was sent to, and how they came."""
+    """Copies it was sent to, and the paths they came by."""
     messages: list[OutboundMessage] = field(default_factory=list)
-    """What carries it, of a large one: siblings, so that paths with more to carry than they bear share it."""
+    """Messages that carry a large answer: siblings, so that overloaded paths share it."""
 
     @property
     def robot(self) -> NodeName:
@@ -80,7 +80,7 @@ class _Answer:
 
     @property
     def held(self) -> int:
-        """Bytes that stay in memory for it."""
+        """Return the bytes that stay in memory for it."""
         message = self.reply.message
         return len(message.payload) if isinstance(message, ResponseMessage) else 0
 
@@ -90,13 +90,13 @@ class _Answer:
 
 
 class _Lines:
-    """What waits to be sent to one robot in one lane."""
+    """Lines of answers that wait to be sent to one robot in one lane."""
 
     __slots__ = ("copies", "firsts")
 
     def __init__(self) -> None:
         self.firsts: WaitingLine[int] = WaitingLine()
-        """Answers of which nothing was sent."""
+        """Answers that were sent to no copy yet."""
         self.copies: WaitingLine[tuple[int, int]] = WaitingLine()
         """(answer, copy) of answers that were sent to another copy."""
 
@@ -116,9 +116,9 @@ class Answers:
         self._answers: dict[int, _Answer] = {}
         self._of: dict[NodeName, dict[RequestId, list[_Answer]]] = {}
         self._got: dict[NodeName, dict[int, None]] = {}
-        """Answers that the robot has got, and that wait for further copies only."""
+        """Answers that the robot has received and that wait only to be sent to further copies."""
         self._lines: OrderedDict[NodeName, tuple[_Lines, ...]] = OrderedDict()
-        """Of robots with answers that wait, the one whose turn is longest ago first."""
+        """Lines of the robots with waiting answers, the one whose turn is longest ago first."""
         self._going: dict[NodeName, None] = {}
         """Robots whose lines may have something to send."""
         self._number_shares = Shares(MAX_ANSWERS)
@@ -127,26 +127,26 @@ class Answers:
         self._numbers = count()
 
     def __len__(self) -> int:
-        """How many answers wait or are under way."""
+        """Return the number of answers that wait or are under way."""
         return len(self._answers)
 
     @property
     def held_bytes(self) -> int:
-        """Bytes of their payloads."""
+        """Return the bytes of the answers' payloads."""
         return self._byte_shares.used
 
     def unsent(self, robots: Collection[NodeName]) -> int:
-        """How many answers to these robots wait for room, and are not on their way to any copy."""
+        """Return the number of answers to these robots that wait for room and are not on their way to any copy."""
         return sum(len(line.firsts) for robot in robots for line in self._lines.get(robot, ()))
 
     # -- what comes in --------------------------------------------------------------------------------------------
 
     def send(self, replies: list[Reply], now: float) -> None:
-        """Send these as soon as there is room."""
+        """Send these replies as soon as there is room."""
         for reply in replies:
             self._take(reply, now)
         for reply in replies:
-            # As many as came: these, or others that wait for longer. Who has no room has none for a second one.
+            # As many as came: these, or others that have waited longer. A robot without room has none for a second one.
             self._send_next(reply.waiter.path.peer, now)
         self._let_go((reply.waiter.path.peer for reply in replies), now)
 
@@ -163,10 +163,10 @@ class Answers:
             answer.waiting[copy] = path
             if answer.sent:
                 self._line_up_copies(answer, (copy,))
-        # Else that copy came twice, cut anew: its answer is on its way.
+        # Otherwise that copy came twice, as another message: its answer is on its way.
 
     def _known(self, robot: NodeName, reply: Reply) -> _Answer | None:
-        """Return what is on its way already and says the same, or more: the answer's bytes may be kept here only."""
+        """Return the answer under way that says the same or more: its bytes may be kept only here."""
         message = reply.message
         for answer in self._of.get(robot, {}).get(message.request_id, ()):
             known = answer.reply.message
@@ -197,11 +197,11 @@ class Answers:
     def _refusal(self, answer: _Answer, why: str) -> Reply:
         text = f"it ran, but its answer of {answer.held} bytes is not sent: {why}"
         rejection = RejectionMessage(answer.request_id, answer.reply.waiter.copy, RejectReason.FORGOTTEN, text)
-        # The answer's deadline may be over; this is of use until its time is, and waits behind no large answer.
+        # The answer's deadline may be over; the rejection is useful until `expires`, and waits behind no large answer.
         return replace(answer.reply, message=rejection, priority=Priority.HIGH, deadline=answer.reply.expires)
 
     def _let_copies_go(self, robot: NodeName, held: int) -> bool:
-        """Make room in memory: let go what the robot has got already."""
+        """Make room in memory by dropping answers that the robot has received already."""
         for number in list(self._got.get(robot, ())):
             self._forgo_copies(self._answers[number])
             if self._byte_shares.fits(robot, held):
@@ -215,7 +215,7 @@ class Answers:
     # -- what goes out --------------------------------------------------------------------------------------------
 
     def on_room(self, now: float) -> None:
-        """Messages ended: what waits may find room."""
+        """Send what waits for room, as messages have ended."""
         robots: dict[NodeName, None] = {}
         for robot, request_id in self._outbox.take_answers_over():
             robots[robot] = None
@@ -230,13 +230,13 @@ class Answers:
         self._let_go(robots, now)
 
     def _let_go(self, robots: Iterable[NodeName], now: float) -> None:
-        """Send what waits for these robots and has room now, as much of it at once as the turn has room for."""
+        """Send what waits for these robots and has room now, as much at once as this turn allows."""
         self._going.update((robot, None) for robot in robots if self._next(robot, now) is not None)
         if self._going:
             self._backlog.add(self._steps, now, "answers")
 
     def _steps(self) -> Iterator[Step]:
-        """Send one answer at a time, of each robot in turn."""
+        """Send one answer at a time, for each robot in turn."""
         while self._going:
             robot = next(iter(self._going))
             del self._going[robot]
@@ -247,7 +247,7 @@ class Answers:
             self._going[robot] = None
 
     def _next(self, robot: NodeName, now: float) -> tuple[_Answer, int | None] | None:
-        """Return the answer that is next and has room, and the copy to which it goes; None as copy: not sent yet."""
+        """Return the next answer that has room, and the copy to send it to; None as copy: not sent yet."""
         for line in self._lines.get(robot, ()):
             if (number := line.firsts.first(now)) is not None:
                 answer, copy = self._answers[number], None
@@ -260,7 +260,7 @@ class Answers:
         return None
 
     def _send_next(self, robot: NodeName, now: float) -> bool:
-        """Send one message of what waits; returns whether there was one to send, and room for it."""
+        """Send one waiting message; return whether there was one, and room for it."""
         found = self._next(robot, now)
         if found is None:
             return False
@@ -277,7 +277,7 @@ class Answers:
         return True
 
     def _best_copy(self, answer: _Answer) -> int:
-        """Return the copy to which a large answer goes first: by a path that is up and has the least to carry."""
+        """Return the copy to send a large answer to first: its path is up and has the least to carry."""
 
         def load(copy: int) -> tuple[bool, int]:
             path = answer.waiting[copy]
@@ -322,14 +322,14 @@ class Answers:
     # -- what ends otherwise --------------------------------------------------------------------------------------
 
     def drop(self, robot: NodeName, request_id: RequestId) -> None:
-        """The robot called this request off: what is unsent of its answers stays here."""
+        """Drop what is unsent of the answers to a request that the robot called off."""
         for answer in self._of.get(robot, {}).get(request_id, [])[:]:
             self._remove(answer)
         self._outbox.drop_answers(robot, request_id)
 
     def drop_robot(self, robot: NodeName) -> list[Step]:
-        """The robot's session is over, and so is what was on its way there. Returns what lets go of it."""
-        self._lines.pop(robot, None)  # at once: letting go makes room, which nothing of it is to take
+        """End what was on its way to a robot whose session is over; return the steps that drop it."""
+        self._lines.pop(robot, None)  # at once: dropping makes room, which none of these answers may take
         return in_groups(self._remove, chain.from_iterable(self._of.get(robot, {}).values()))
 
     def _remove(self, answer: _Answer) -> None:
@@ -369,11 +369,11 @@ class Answers:
             heapq.heapify(self._timers)
 
     def next_timer(self) -> float | None:
-        """When `handle_timer` is wanted."""
+        """Return when to call `handle_timer`."""
         return first_of(self._timers, self._answers)
 
     def handle_timer(self, now: float) -> None:
-        """Give up what is of no use any more, and say so of answers of which nothing has left."""
+        """Give up answers that are useless by now, and reject those of which nothing has left."""
         while self._timers and self._timers[0][0] <= now and self._backlog.allows(now):
             answer = self._answers.get(heapq.heappop(self._timers)[1])
             if answer is not None:

@@ -1,4 +1,4 @@
-"""Cloud side: requests called off before any copy of them came. Such a copy, when it comes, is not run."""
+"""Cloud side: remembers requests called off before any copy of them came. Such a copy is not run when it comes."""
 
 from __future__ import annotations
 
@@ -13,29 +13,29 @@ if TYPE_CHECKING:
     from sidecar.core.seam.stats import EngineStats
 
 MAX_EARLY_CANCELS = 16_384
-"""Ids kept; one robot may fill half: 130 requests a second, all overtaken, for REMEMBER_CANCEL_S. What is not kept may
-run once, as if it had not been called off."""
+"""Ids kept; one robot may fill half: 130 requests a second, all overtaken by their cancels, for REMEMBER_CANCEL_S. A
+request whose id is not kept may run once, as if it had not been called off."""
 REMEMBER_CANCEL_S = 60.0
-"""What a datagram may spend in the queues of the network."""
+"""Longest time that a datagram may spend in the queues of the network."""
 
 
 class EarlyCancels:
-    """Ids of requests that were called off before they came, with the robot that did so."""
+    """Ids of requests that were called off before they came, with the robot that called them off."""
 
     __slots__ = ("_ids", "_shares", "_stats")
 
     def __init__(self, stats: EngineStats) -> None:
         self._stats = stats
         self._shares = Shares(MAX_EARLY_CANCELS)
-        # In the order in which they are forgotten: all are kept equally long.
+        # Ordered by when they are forgotten: all are kept equally long.
         self._ids: OrderedDict[tuple[NodeName, RequestId], float] = OrderedDict()
-        """And when each is forgotten."""
+        """(robot, request) -> when it is forgotten."""
 
     def __len__(self) -> int:
         return len(self._ids)
 
     def add(self, robot: NodeName, request_id: RequestId, now: float) -> None:
-        """`robot` does not want this request any more."""
+        """Remember that `robot` does not want this request any more."""
         self._forget_old(now)
         if (robot, request_id) in self._ids:
             return
@@ -46,7 +46,7 @@ class EarlyCancels:
         self._ids[robot, request_id] = now + REMEMBER_CANCEL_S
 
     def holds(self, robot: NodeName, request_id: RequestId, now: float) -> bool:
-        """Whether this robot called the request off."""
+        """Return whether this robot called the request off."""
         self._forget_old(now)
         return self._ids.get((robot, request_id), now) > now
 

@@ -1,15 +1,15 @@
-"""Cloud side: every request runs at most once here, however many copies arrive (architecture: Semantics).
+"""Cloud side: runs every request at most once here, however many copies arrive (architecture: Semantics).
 
 A request is running (copies wait for its result), answered (copies get the cached answer) or forgotten: its id is
-kept as a tombstone after the answer had to go, so that a very late copy is refused and not run again. An id is let go
-only when no copy can come any more: its sender gives a request up when its lifetime is over. Of a request that was
-refused unrun the copies are remembered, not the id (`refused_copies.py`): another copy may run.
+kept as a tombstone after the answer was dropped, so that a very late copy is refused and not run again. An id is
+dropped only when no copy can come any more: its sender gives a request up when its lifetime is over. If a request was
+refused without being run, its copies are remembered, not its id (`refused_copies.py`): another copy may run.
 
-An id counts for the robot that sent it only: a member that learns another's ids, and sends them first, takes nothing
+An id counts only for the robot that sent it: a member that learns another's ids, and sends them first, takes nothing
 from it.
 
-A robot that has its answer calls a request off. It does not run then if the local server has not got it yet; nobody
-is answered any more, and copies that still come are ignored.
+A robot that has its answer calls a request off. Then the request does not run if the local server has not got it yet,
+nobody is answered any more, and copies that still come are ignored.
 """
 
 from __future__ import annotations
@@ -38,28 +38,28 @@ if TYPE_CHECKING:
     from sidecar.core.wire.messages import RequestMessage
 
 MAX_RUNNING = 8192
-"""Requests that local servers work on at once."""
+"""Most requests that local servers work on at once."""
 MAX_RUNNING_BYTES = 512 * 1024 * 1024
-"""Payloads of those requests: local servers may be slower than the robots. One robot may hold half."""
+"""Most payload bytes of those requests: local servers may be slower than the robots. One robot may hold half."""
 MAX_WAITERS = 16
-"""Copies that wait for one result; a robot sends one for each of its interfaces."""
+"""Most copies that wait for one result; a robot sends one for each of its interfaces."""
 MAX_CACHED_BYTES = 64 * 1024 * 1024
-"""Answers kept for late copies; of the robot that holds the most, the oldest goes first."""
+"""Bytes of answers kept for late copies; beyond that the robot that holds the most loses its oldest."""
 MAX_REMEMBERED = 262_144
 """Ids remembered; one robot may fill half: 2000 requests a second for MIN_REMEMBER_S."""
 REMEMBER_LIFETIMES = 2.0
-"""An id is remembered for this many of its request's lifetimes after the answer ..."""
+"""An id is remembered after the answer for this many lifetimes of its request ..."""
 MIN_REMEMBER_S = 60.0
-"""... but at least this long: what a datagram may spend in the queues of the network."""
+"""... but at least this long: the time that a datagram may spend in the queues of the network."""
 SAY_WITHIN_S = 0.5
-"""An execution whose patience is over counts as lost when the application has not said what became of it."""
+"""An execution whose patience is over counts as lost unless the application says within this time what became of it."""
 
 TIMER_SLACK = 1024
-"""Timers of answered requests that may lie around before they are swept out."""
+"""Timers of answered requests allowed to remain before they are swept out."""
 
 
 class _Key(NamedTuple):
-    """A request, by who asked and the id that it gave."""
+    """A request, by the robot that asked and the id it chose."""
 
     robot: NodeName
     request_id: RequestId
@@ -67,7 +67,7 @@ class _Key(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Waiter:
-    """Where one copy's answer goes."""
+    """The destination of one copy's answer."""
 
     path: PathId
     copy: int
@@ -75,7 +75,7 @@ class Waiter:
 
 @dataclass(frozen=True, slots=True)
 class Reply:
-    """Send this to the robot: wanted by `deadline`, of no use after `expires`."""
+    """A message to the robot, wanted by `deadline` and useless after `expires`."""
 
     waiter: Waiter
     service: ServiceName
@@ -94,11 +94,11 @@ class _Execution:
     deadline: float
     """When the robot wants its answer."""
     expires: float
-    """When no robot waits any more."""
+    """When the robot stops waiting."""
     patience_ends: float
-    """When the local server is given up, whoever waits."""
+    """When the local server is given up, even if the robot waits."""
     lifetime_s: float
-    """The longest that a copy asked for."""
+    """The longest lifetime that a copy asked for."""
     size: int
     """Bytes of the request's payload."""
     waiters: list[Waiter] = field(default_factory=list)
@@ -107,34 +107,34 @@ class _Execution:
     refusal: tuple[RejectReason, str] | None = None
     cancelled: bool = False
     given_up: bool = False
-    """Its patience is over: whoever knows whether the local server got it is asked."""
+    """Its patience is over: the application is asked whether the local server got it."""
 
     @property
     def robot(self) -> NodeName:
-        """Who asked."""
+        """Return the robot that asked."""
         return self.key.robot
 
     @property
     def request_id(self) -> RequestId:
-        """What the robot calls it."""
+        """Return the robot's id of the request."""
         return self.key.request_id
 
     @property
     def ends(self) -> float:
-        """When this execution is given up."""
+        """Return when this execution is given up."""
         return min(self.expires, self.patience_ends)
 
 
 class ExecutionTable:
-    """All requests this sidecar has seen lately."""
+    """All requests this sidecar has seen recently."""
 
     def __init__(self, stats: EngineStats) -> None:
         self._stats = stats
         self._by_request: dict[_Key, _Execution] = {}
-        """Running."""
+        """Executions that run."""
         self._finished: dict[_Key, _Execution] = {}
         self._forget_at: list[tuple[float, _Key]] = []
-        """When each finished one is forgotten: a heap."""
+        """Heap of when each finished execution is forgotten."""
         self._running: dict[ExecutionId, _Execution] = {}
         self._running_shares = Shares(MAX_RUNNING)
         self._running_bytes = Shares(MAX_RUNNING_BYTES)
@@ -147,15 +147,15 @@ class ExecutionTable:
 
     @property
     def running(self) -> int:
-        """How many requests are being worked on."""
+        """Return the number of requests being worked on."""
         return len(self._running)
 
     def awaited(self, robots: Collection[NodeName]) -> int:
-        """How many of those being worked on one of these robots still waits for."""
+        """Return the number of requests being worked on that one of these robots still waits for."""
         return sum(1 for execution in self._running.values() if not execution.cancelled and execution.robot in robots)
 
     def knows(self, robot: NodeName, request_id: RequestId) -> bool:
-        """Whether a copy of this robot's request came before."""
+        """Return whether a copy of this robot's request came before."""
         return self._find(robot, request_id) is not None
 
     def _find(self, robot: NodeName, request_id: RequestId) -> _Execution | None:
@@ -167,9 +167,9 @@ class ExecutionTable:
     ) -> ExecuteRequest | Reply | None:
         """Take one copy: run the request, answer from the cache, refuse, or (None) let it wait for the result.
 
-        What comes first when its lifetime is over is neither run nor answered: its robot has given it up.
+        A request whose first copy comes after its lifetime is neither run nor answered: its robot has given it up.
 
-        The local server is waited for as long as the robot waits, but at most `patience_s`.
+        The local server may take as long as the robot waits, but at most `patience_s`.
         """
         waiter = Waiter(path, message.copy)
         key = _Key(path.peer, message.request_id)
@@ -251,7 +251,7 @@ class ExecutionTable:
         self, waiter: Waiter, message: RequestMessage, reason: RejectReason, text: str, now: float
     ) -> Reply:
         """Refuse a copy: the request has not run here, and another copy of it may run later."""
-        # These not by name, which is whatever a peer wrote: it would make as many counters as it likes.
+        # These are not counted by name: a peer may write any name, and would create as many counters as it likes.
         if reason is RejectReason.NOT_OFFERED:
             self._stats.dropped["request_for_unknown_service"] += 1
         elif reason is RejectReason.FORBIDDEN:
@@ -264,7 +264,7 @@ class ExecutionTable:
         return Reply(waiter, message.service, rejection, message.priority, now + message.deadline_left_s, expires)
 
     def complete(self, execution_id: ExecutionId, payload: bytes, processing_s: float, now: float) -> list[Reply]:
-        """The local server answered."""
+        """Take the local server's answer; return the replies to send."""
         if len(payload) > MAX_PAYLOAD_BYTES:
             text = f"the answer has {len(payload)} bytes, the limit is {MAX_PAYLOAD_BYTES}"
             return self.refuse(execution_id, RejectReason.TOO_LARGE, text, now)
@@ -280,7 +280,7 @@ class ExecutionTable:
         return [self._reply(execution, waiter, execution.expires) for waiter in execution.waiters]
 
     def refuse(self, execution_id: ExecutionId, reason: RejectReason, text: str, now: float) -> list[Reply]:
-        """The local server did not answer."""
+        """Note that the local server did not answer; return the replies to send."""
         execution = self._finish(execution_id)
         if execution is None:
             return []
@@ -302,14 +302,14 @@ class ExecutionTable:
         self._refused.add(copy, reason, text, max(expires, now + MIN_REMEMBER_S), now)
 
     def cancel(self, robot: NodeName, request_id: RequestId, now: float) -> CancelExecution | None:
-        """The robot wants no further answer; returns what to tell the application, if anything."""
+        """Take a robot's cancel, which may precede its request; return what to tell the application, if anything."""
         if not self.knows(robot, request_id):
             self._early_cancels.add(robot, request_id, now)
             return None
         return self.call_off(robot, request_id)
 
     def call_off(self, robot: NodeName, request_id: RequestId) -> CancelExecution | None:
-        """Answer this request no more; returns what to tell the application, if anything."""
+        """Stop answering this request; return what to tell the application, if anything."""
         execution = self._find(robot, request_id)
         if execution is None or execution.cancelled:
             return None
@@ -317,7 +317,7 @@ class ExecutionTable:
         return CancelExecution(execution.id, robot) if execution.id in self._running else None
 
     def of_robot(self, robot: NodeName) -> list[RequestId]:
-        """Return the robot's requests that are being worked on for somebody."""
+        """Return the robot's requests that are being worked on and not called off."""
         return [one.request_id for one in self._running.values() if one.robot == robot and not one.cancelled]
 
     def _cancel(self, execution: _Execution) -> None:
@@ -327,15 +327,15 @@ class ExecutionTable:
         self._cache.remove(*execution.key)
 
     def next_timer(self) -> float | None:
-        """When `handle_timer` is wanted."""
+        """Return when to call `handle_timer`."""
         return first_of(self._timers, self._running)
 
     def handle_timer(self, now: float, backlog: Backlog) -> tuple[list[AbandonExecution], list[Reply]]:
         """Give up executions that took too long.
 
-        Returns them, and what those robots are told that still wait and of which the application has not said within
-        SAY_WITHIN_S whether the local server got it: it may have run, so its id stays. Also forgets what no copy can
-        ask for any more, so that answers do not stay in memory when the traffic ends.
+        Return them, and the replies for executions that robots still wait for and of which the application has not said
+        within SAY_WITHIN_S whether the local server got them: they may have run, so their ids stay. Also forget what no
+        copy can ask for any more, so that answers do not stay in memory when the traffic ends.
         """
         self._forget_old(now)
         abandoned = []
@@ -365,7 +365,7 @@ class ExecutionTable:
         return abandoned, replies
 
     def _finish(self, execution_id: ExecutionId) -> _Execution | None:
-        """Take an execution out of the running ones; None when it is not one of them (any more)."""
+        """Remove and return a running execution; None if it does not run (any more)."""
         execution = self._running.pop(execution_id, None)
         if execution is None:
             self._stats.dropped["answer_to_unknown_execution"] += 1
@@ -376,7 +376,7 @@ class ExecutionTable:
         return execution
 
     def _remember(self, execution: _Execution, now: float) -> None:
-        """It ran or may have run: never again."""
+        """Remember an execution that ran or may have run, so that it never runs again."""
         self._finished[execution.key] = execution
         self._finished_shares.take(execution.robot)
         forget_at = now + max(REMEMBER_LIFETIMES * execution.lifetime_s, MIN_REMEMBER_S)
@@ -397,7 +397,7 @@ class ExecutionTable:
             self._stats.dropped["cached_answer_evicted"] += 1
 
     def _forget_old(self, now: float) -> None:
-        """Drop ids that no copy can ask for any more: those of a burst, the rest the next times."""
+        """Drop ids that no copy can ask for any more: at most one burst of them, the rest in later calls."""
         for _ in range(FORGOTTEN_AT_ONCE):
             if not self._forget_at or self._forget_at[0][0] > now:
                 return

@@ -1,4 +1,4 @@
-"""Cloud side: what is told of robots that ask for services they may not call; seldom enough for a log."""
+"""Cloud side: reports robots that ask for services they may not call, seldom enough for a log."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ if TYPE_CHECKING:
     from protos.model.ids import NodeName, ServiceName
 
 TELL_EVERY_S = 10.0
-"""Between two notices on one robot."""
+"""Least time between two notices about one robot."""
 MAX_ROBOTS = 1024
-"""Robots noted; then the one noted first goes, and the next call of it is told at once."""
+"""Robots noted; beyond that the one noted first is forgotten, and its next call is reported at once."""
 
 
 @dataclass(slots=True)
@@ -29,7 +29,7 @@ class ForbiddenCalls:
         self._robots: dict[NodeName, _Noted] = {}
 
     def note(self, robot: NodeName, service: ServiceName, now: float) -> CallsForbidden | None:
-        """One more call was refused; returns what to tell of it now, if anything."""
+        """Count one more refused call; return the notice to give now, if any."""
         noted = self._robots.get(robot)
         if noted is None:
             if len(self._robots) >= MAX_ROBOTS:

@@ -1,8 +1,8 @@
-"""Cloud side: copies that were refused although their requests have not run.
+"""Cloud side: remembers copies that were refused and whose requests have not run.
 
-Who sent such a copy may go to another server with the request, as it certainly did not run. The same copy may come once
-more, cut anew as another message, when the server would take it: then it is refused again. Another copy of the request
-is sent only by who knows what became of all the others: it may run.
+The robot that sent such a copy may take the request to another server, as it certainly did not run. If the same copy
+comes once more, as another message, when the server would take it, it is refused again. Another copy of the request may
+run: the robot sends one only if it knows what became of all the others.
 """
 
 from __future__ import annotations
@@ -18,8 +18,8 @@ if TYPE_CHECKING:
     from sidecar.core.seam.stats import EngineStats
 
 MAX_REFUSED_COPIES = 65_536
-"""Copies remembered; one robot may fill half: 500 refused copies a second for a minute. What is not remembered may run
-if it comes once more, and somewhere else besides."""
+"""Copies remembered; one robot may fill half: 500 refused copies a second for a minute. A copy that is not remembered
+may run if it comes once more, besides running on another server."""
 
 
 class RefusedCopy(NamedTuple):
@@ -31,7 +31,7 @@ class RefusedCopy(NamedTuple):
 
 
 class RefusedCopies:
-    """Which copies were refused, and why."""
+    """Refused copies, with the reasons."""
 
     __slots__ = ("_forget_at", "_reasons", "_shares", "_stats")
 
@@ -40,13 +40,13 @@ class RefusedCopies:
         self._shares = Shares(MAX_REFUSED_COPIES)
         self._reasons: dict[RefusedCopy, tuple[RejectReason, str]] = {}
         self._forget_at: list[tuple[float, RefusedCopy]] = []
-        """A heap."""
+        """Heap of when each copy is forgotten."""
 
     def __len__(self) -> int:
         return len(self._reasons)
 
     def add(self, copy: RefusedCopy, reason: RejectReason, text: str, forget_at: float, now: float) -> None:
-        """This copy is refused. It cannot come any more from `forget_at` on."""
+        """Remember a refused copy, which cannot come any more from `forget_at` on."""
         self._forget_old(now)
         if copy in self._reasons:
             return
@@ -63,7 +63,7 @@ class RefusedCopies:
         return self._reasons.get(copy)
 
     def _forget_old(self, now: float) -> None:
-        """Those of a burst, the rest the next times: what stays longer is refused longer, though it cannot come."""
+        """Drop one burst of old copies, the rest in later calls: a copy that stays is refused, but it cannot come."""
         for _ in range(FORGOTTEN_AT_ONCE):
             if not self._forget_at or self._forget_at[0][0] > now:
                 return

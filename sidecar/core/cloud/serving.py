@@ -1,5 +1,5 @@
-"""Cloud side: robots' requests from their arrival to their answers (paper, figure "Workflow Diagram", request steps 7
-to 9). Which of them run is `executions.py`'s."""
+"""Cloud side: takes robots' requests from their arrival to their answers (paper, figure "Workflow Diagram", request
+steps 7 to 9). `executions.py` decides which of them run."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ class ServingParts:
     stats: EngineStats
     emit: Callable[[ApplicationEvent], None]
     may_call: Callable[[NodeName, ServiceName], bool]
-    """Whether the access policy lets a robot call a service here."""
+    """Return whether the access policy lets a robot call a service here."""
     backlog: Backlog
 
 
@@ -56,20 +56,20 @@ class Serving:
 
     @property
     def running(self) -> int:
-        """How many requests are being worked on."""
+        """Return the number of requests being worked on."""
         return self.executions.running
 
     def awaited(self, robots: Collection[NodeName]) -> int:
-        """How many requests one of these robots waits for that run here, or whose answers wait for room."""
+        """Return the number of these robots' awaited requests that run here or whose answers wait for room."""
         return self.executions.awaited(robots) + self.answers.unsent(robots)
 
     @property
     def offers(self) -> tuple[ServiceOffer, ...]:
-        """What can be run here."""
+        """Return what can be run here."""
         return tuple(self._offers.values())
 
     def set_offers(self, offers: Iterable[ServiceOffer]) -> None:
-        """The services that local servers offer right now."""
+        """Replace the services that local servers offer right now."""
         self._offers = {offer.name: offer for offer in offers}
 
     def drain(self) -> None:
@@ -79,7 +79,7 @@ class Serving:
     # -- the robots -----------------------------------------------------------------------------------------------
 
     def on_request(self, path: PathId, message: RequestMessage, now: float) -> None:
-        """A copy of a request arrived."""
+        """Take a copy of a request that arrived."""
         refusal = self._refusal(path.peer, message, now)
         if refusal and not self.executions.knows(path.peer, message.request_id):
             waiter = Waiter(path, message.copy)
@@ -98,7 +98,7 @@ class Serving:
             notice = self._forbidden.note(robot, message.service, now)
             if notice is not None:
                 self._parts.emit(notice)
-            # Before all else: who may not call a service does not learn either whether it is offered here.
+            # First of all: a robot that may not call a service does not learn whether it is offered here either.
             return RejectReason.FORBIDDEN, f"the access policy does not let {robot} call {message.service} here"
         offer = self._offers.get(message.service)
         if offer is None:
@@ -110,22 +110,22 @@ class Serving:
         return None
 
     def on_cancel(self, robot: NodeName, message: CancelMessage, now: float) -> None:
-        """The robot has its answer: send nothing more of ours, and run the request only if it runs already."""
+        """Send no more answers to a robot that has one, and do not start its request if it does not run yet."""
         event = self.executions.cancel(robot, message.request_id, now)
         if event is not None:
             self._parts.emit(event)
         self.answers.drop(robot, message.request_id)
 
     def on_room(self, now: float) -> None:
-        """Less is under way than before: send what waited for room."""
+        """Send what waited for room, since less is under way than before."""
         self.answers.on_room(now)
 
     def on_robot_gone(self, robot: NodeName) -> list[Step]:
-        """The robot is not talked to any more, for a while at least. Returns what is left to do."""
+        """Stop sending to a robot, for a while at least; return the steps left to do."""
         return self.answers.drop_robot(robot)
 
     def on_session_over(self, robot: NodeName) -> list[Step]:
-        """The robot said goodbye or restarted: returns what calls off what its servers have not got yet."""
+        """Return the steps that call off what servers have not got yet from a robot that said goodbye or restarted."""
         return in_groups(partial(self._call_off, robot), self.executions.of_robot(robot))
 
     def _call_off(self, robot: NodeName, request: RequestId) -> None:
@@ -136,22 +136,22 @@ class Serving:
     # -- the application ------------------------------------------------------------------------------------------
 
     def complete(self, execution: ExecutionId, payload: bytes, processing_s: float, now: float) -> None:
-        """The local server answered."""
+        """Send the local server's answer."""
         self.answers.send(self.executions.complete(execution, payload, processing_s, now), now)
 
     def refuse(self, execution: ExecutionId, reason: RejectReason, detail: str, now: float) -> None:
-        """The request was not or will not be answered."""
+        """Send the refusal of a request that was not or will not be answered."""
         self.answers.send(self.executions.refuse(execution, reason, detail, now), now)
 
     # -- time -----------------------------------------------------------------------------------------------------
 
     def next_timer(self) -> float | None:
-        """When `handle_timer` is wanted."""
+        """Return when to call `handle_timer`."""
         timers = (self.executions.next_timer(), self.answers.next_timer())
         return min((timer for timer in timers if timer is not None), default=None)
 
     def handle_timer(self, now: float) -> None:
-        """Give up what took too long to run, or to be sent, as much of it as the turn has room for."""
+        """Give up what took too long to run or to be sent, as much of it as this turn has room for."""
         abandoned, replies = self.executions.handle_timer(now, self._parts.backlog)
         for event in abandoned:
             self._parts.emit(event)
