@@ -1,9 +1,9 @@
-"""Where peers may be looked for: the newest addresses that each of them has signed itself.
+"""Decides where peers may be looked for: at the newest addresses that each of them has signed itself.
 
-The control plane relays them. What it adds, changes or plays again is not used, so that it can not aim a fleet at an
-address of its choosing; the addresses that the peer signed before stay in use. They are remembered for longer than the
-peer is known: taking it out of the view and putting it back brings no old ones into use. What was signed with a
-certificate that is revoked by now is forgotten with the next run that the view tells of.
+The control plane relays them. What it adds, changes or replays is not used, so that it cannot aim a fleet at an address
+of its choosing; the addresses that the peer signed before stay in use. They are remembered for longer than the peer is
+known: taking it out of the view and putting it back brings no old ones into use. Addresses signed with a certificate
+that has been revoked are forgotten when the view lists another run of the peer.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from sidecar.core.crypto.session import OwnSession
 
 MAX_REMEMBERED = 8192
-"""Peers whose newest announcement is remembered; twice those of a view, so that it is the absent ones that go."""
+"""Peers whose newest announcement is remembered; twice those of a view, so that the absent ones are forgotten."""
 
 
 class _Announcement(NamedTuple):
@@ -31,7 +31,7 @@ class _Announcement(NamedTuple):
     used: tuple[Candidate, ...]
     signed: bool
     by: Peer
-    """Who announced it, with the credential of that run."""
+    """The peer that announced it, with the credential of that run."""
 
 
 class Announced:
@@ -42,12 +42,12 @@ class Announced:
         self._dropped = dropped
         self._newest: OrderedDict[NodeName, _Announcement] = OrderedDict()
         self.eras: Counter[NodeName] = Counter()
-        """How often a name was given to somebody new, after what its owner signed was revoked."""
+        """Times that a name got a new owner, after the certificate of the old one was revoked."""
         self.ignored: dict[NodeName, str] = {}
-        """Why what was told last of a peer's addresses is not used; of peers that are remembered, or in the view."""
+        """Why the last news of a peer's addresses is not used, for peers that are remembered or in the view."""
 
     def candidates_of(self, told: Peer) -> tuple[Candidate, ...]:
-        """Return the addresses to use for a peer of which this is told now."""
+        """Return the addresses to use for a peer that the view now describes as `told`."""
         newest = self._newest.get(told.name)
         if newest is not None and newest.incarnation != told.incarnation and self._is_revoked(newest.by):
             # A thief may have signed with the largest incarnation there is.
@@ -71,11 +71,11 @@ class Announced:
         return newest.used
 
     def _judge(self, told: Peer, newest: _Announcement | None) -> tuple[str, _Announcement | None]:
-        """Return what is wrong with news of a peer's addresses, or nothing, and the announcement to go by."""
+        """Return what is wrong with news of a peer's addresses (empty: nothing), and the announcement to use."""
         nothing_said = not told.candidates and not told.candidates_signature
         if newest is not None and newest.signed:
             if nothing_said:
-                return "", newest  # it has a new run or certificate, with which it signs them in a moment
+                return "", newest  # it has a new run or certificate, with which it is about to sign them
             if (told.incarnation, told.candidates_serial) <= (newest.incarnation, newest.serial):
                 self._dropped["old_candidates"] += 1
                 return "they are older than what it announced before", newest
@@ -99,12 +99,12 @@ class Announced:
         return False
 
     def forget_all_but(self, names: set[NodeName]) -> None:
-        """Only these are peers now: nothing is said of others any more."""
+        """Keep `ignored` for these names only: the others are no peers any more."""
         self.ignored = {name: why for name, why in self.ignored.items() if name in names}
 
 
 def _cut(candidates: tuple[Candidate, ...]) -> tuple[Candidate, ...]:
-    """Return the first ones of each interface."""
+    """Return the first MAX_CANDIDATES_OF_INTERFACE candidates of each interface."""
     counts: Counter[InterfaceId] = Counter()
     used = []
     for candidate in candidates:

@@ -1,4 +1,4 @@
-"""Which servers requests go to at present: links are told, so that the paths to them do not rest."""
+"""Remembers which servers requests go to at present. Links are told, so that the paths to them do not rest."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ ATTEND_EVERY_S = 0.5
 
 
 class Attention:
-    """The servers that links were told of a moment ago."""
+    """The servers that links were told about less than ATTEND_EVERY_S ago."""
 
     __slots__ = ("_told", "_until")
 
@@ -21,7 +21,7 @@ class Attention:
         self._until = now
 
     def needs(self, servers: frozenset[NodeName], now: float) -> bool:
-        """A request goes to some of these servers: whether links must be told."""
+        """Return whether links must be told that a request goes to some of these servers."""
         if now >= self._until:
             self._told = frozenset()
             self._until = now + ATTEND_EVERY_S

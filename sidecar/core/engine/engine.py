@@ -1,4 +1,4 @@
-"""The sidecar's requests, peers and routes: what all links share. Sans-IO; the caller serialises the calls.
+"""Holds the sidecar's requests, peers and routes, which all links share. Sans-IO; the caller serialises the calls.
 
 Inputs are method calls with `now`; outputs are `take_commands` (for the links) and `take_events` (for the
 application). Nothing here builds, seals or parses a datagram.
@@ -76,17 +76,17 @@ if TYPE_CHECKING:
     from sidecar.core.rules.budget import Budget
 
 SWEEP_EVERY_S = 1.0
-"""How often old messages and half messages are looked for."""
+"""Interval of the search for old messages and partial messages."""
 
 
 @dataclass(frozen=True, slots=True)
 class EngineConfig:
-    """What the engine must know from the configuration."""
+    """The part of the configuration that the engine needs."""
 
     role: Role
     rules: tuple[ServiceRule, ...]
     budgets: tuple[Budget, ...] = ()
-    """Robot: the first that matches an interface's name decides."""
+    """Robot: budgets, of which the first that matches an interface's name decides."""
 
 
 class Engine:
@@ -101,7 +101,7 @@ class Engine:
         self._events: list[ApplicationEvent] = []
         self._interfaces: set[InterfaceName] = set()
         self._away: dict[NodeName, SessionId] = {}
-        """Cloud: robots that are no peers any more, as nothing was heard of them, and that may be back."""
+        """Cloud: robots that fell silent, are no peers any more, and may come back with this session."""
         self._carried: Mapping[ServiceName, bool | None] = {}
         self._sweep_at = now + SWEEP_EVERY_S
         self._attention = Attention(now)
@@ -145,23 +145,23 @@ class Engine:
     # -- outputs --------------------------------------------------------------------------------------------------
 
     def take_commands(self) -> list[tuple[InterfaceName | None, LinkCommand]]:
-        """Return what the links shall do; None as interface means all of them."""
+        """Return the commands for the links; None as interface means all of them."""
         commands, self._commands = self._commands, []
         return commands
 
     def take_events(self) -> list[ApplicationEvent]:
-        """Return what the application shall know."""
+        """Return the events for the application."""
         events = self._events[:]
         self._events.clear()
         return events
 
     def next_decoding(self) -> Decoding | None:
-        """Return the message of which a slice is to be computed next, outside any lock."""
+        """Return the message whose next slice is to be computed, outside any lock."""
         return self._inbound.next_decoding()
 
     @property
     def decodings(self) -> int:
-        """How many messages are to be decoded."""
+        """Return the number of messages to decode."""
         return self._inbound.decodings
 
     def _to_link(self, command: PathCommand) -> None:
@@ -186,31 +186,31 @@ class Engine:
         self._count_in_flight()
 
     def judge_answer(self, request_id: RequestId, copy: int, problem: str | None, now: float) -> None:
-        """Robot: this copy's answer is with the application, or can not be delivered, for this reason."""
+        """Robot: note that this copy's answer was delivered to the application, or cannot be because of `problem`."""
         self._requests.judge_answer(request_id, copy, problem, now)
         self._count_in_flight()
 
     def answered_here(self, request_id: RequestId, now: float) -> None:
-        """Robot: the application has its answer, not from the network."""
+        """Robot: note that the application got its answer on the robot."""
         self._requests.answered_here(request_id, now)
         self._count_in_flight()
 
     def complete(self, execution: ExecutionId, payload: bytes, processing_s: float, now: float) -> None:
-        """Cloud: the local server answered."""
+        """Cloud: send the local server's answer."""
         self._serving.complete(execution, payload, processing_s, now)
         self._count_in_flight()
 
     def refuse(self, execution: ExecutionId, reason: RejectReason, detail: str, now: float) -> None:
-        """Cloud: the request was not or will not be answered."""
+        """Cloud: refuse a request that was not or will not be answered."""
         self._serving.refuse(execution, reason, detail, now)
         self._count_in_flight()
 
     def set_offers(self, offers: Iterable[ServiceOffer]) -> None:
-        """Cloud: the services that local servers offer right now."""
+        """Cloud: replace the services that local servers offer right now."""
         self._serving.set_offers(offers)
 
     def set_carried(self, services: Mapping[ServiceName, bool | None]) -> None:
-        """Robot: the proxied services that exist right now, and whether their fallbacks can be asked."""
+        """Robot: replace the proxied services that exist right now, with whether their fallbacks can be asked."""
         self._carried = services
 
     def drain(self) -> None:
@@ -219,7 +219,7 @@ class Engine:
 
     @property
     def busy(self) -> int:
-        """Requests and messages in flight here that somebody still waits for: what is worth staying for."""
+        """Return the number of requests and messages in flight that somebody still waits for: reasons not to exit."""
         peers = frozenset(self.peers.names())
         messages = sum(self._outbox.messages_to(peer) for peer in peers)
         return self._serving.awaited(peers) + self._requests.unanswered + messages
@@ -227,15 +227,15 @@ class Engine:
     # -- the control plane ----------------------------------------------------------------------------------------
 
     def offers(self) -> tuple[ServiceOffer, ...]:
-        """What this sidecar can run."""
+        """Return the services that this sidecar can run."""
         return self._serving.offers
 
     def uses(self) -> tuple[ServiceUse, ...]:
-        """What this sidecar carries."""
+        """Return the services that this sidecar carries."""
         return self._offers.uses(self._carried)
 
     def set_interfaces(self, interfaces: Iterable[InterfaceName], now: float) -> None:
-        """The interfaces that have a link now."""
+        """Replace the interfaces that have a link now."""
         new = set(interfaces)
         gone = self._interfaces - new
         self._interfaces = new
@@ -250,7 +250,7 @@ class Engine:
         self._commands.append((None, SetPeers(self.peers.for_links())))
 
     def apply_peers(self, peer_set: PeerSet, now: float) -> str | None:
-        """Take a view of the peers; returns why it is refused, or None."""
+        """Take a view of the peers; return why it is refused, or None."""
         before = {peer.name: peer.session for peer in self.peers.all()}
         left = {removed.name for removed in peer_set.removed if removed.reason is not RemovalReason.LEASE_EXPIRED}
         error = self.peers.apply(peer_set, self.routes.reaches)
@@ -270,7 +270,7 @@ class Engine:
         return None
 
     def _end_away(self, left: Collection[NodeName], now: float) -> None:
-        """Of the peers that might have come back, some are here again, and others never will be."""
+        """Forget the peers that might have come back: some have, and others never will."""
         for name, session in list(self._away.items()):
             if self.peers.session(name) == session:
                 del self._away[name]
@@ -278,7 +278,7 @@ class Engine:
                 self._forget_session(name, now)
 
     def _follow_offers(self, now: float) -> None:
-        """Other peers than before are known, or they may offer other services."""
+        """Follow the peers' offers, as the peers or their services may have changed."""
         if self._config.role is Role.ROBOT:
             self._backlog.add(self._take_offers, now, "offers")
 
@@ -296,16 +296,16 @@ class Engine:
             self._offers.forget_peer(name)
 
     def services_of_peers(self) -> set[ServiceName]:
-        """Return what the peers offer, of whatever name."""
+        """Return the services that the peers offer, whatever their names."""
         peers = map(self.peers.get, self.peers.names())
         return {offer.name for peer in peers if peer is not None for offer in peer.offers}
 
     def unreached_services(self) -> dict[ServiceName, int]:
-        """Return the services that peers offer and none of these is reached, and how many peers that are."""
+        """Return the services for which no offering peer is reached, each with the number of those peers."""
         return self._offers.unreached
 
     def recheck_peers(self, judged: Iterable[Peer], now: float) -> list[NodeName]:
-        """Judgements changed: sessions of those bad now end; returns the refused taken, as they are `judged` good."""
+        """End the sessions of peers that are bad now; return the refused ones taken, as they are `judged` good."""
         gone, taken = self.peers.recheck(), self.peers.readmit(judged)
         self._commands.append((None, SetPeers(self.peers.for_links())))
         self._follow_offers(now)
@@ -315,7 +315,7 @@ class Engine:
         return taken
 
     def apply_mapping(self, mapping: MappingSet) -> str | None:
-        """Take a mapping; returns why it is refused, or None."""
+        """Take a mapping; return why it is refused, or None."""
         error = self.mapping.apply(mapping, self._interfaces, self.peers.names())
         if error:
             self.stats.nacks += 1
@@ -326,8 +326,8 @@ class Engine:
         return None
 
     def _remember_types(self, mapping: MappingSet) -> None:
-        """Servers that are mapped offer a service with the type that it has here: after a restart that is all we know,
-        and a server that offers it with another type must not win for having come first."""
+        """Remember each mapped service's type, which its mapped servers offer. After a restart that is all we know, and
+        a server that offers another type must not win by coming first."""
         for service in mapping.services:
             if self._offers.knows_type(service.service):
                 continue
@@ -338,11 +338,11 @@ class Engine:
 
     @property
     def offer_conflicts(self) -> frozenset[tuple[ServiceName, NodeName, str]]:
-        """Robot: (service, server, type) of servers left out: the configuration, or the others, have another type."""
+        """Robot: return the servers left out as (service, server, type): the configuration or the others differ."""
         return frozenset(self._offers.conflicts)
 
     def take_urgency(self) -> ReportScope | None:
-        """Robot: what is to be reported before the next report is due, as a path changed or a deadline was missed."""
+        """Robot: return what to report before the next report, since a path changed or a deadline was missed."""
         return self._measurements.take_urgency() if self._config.role is Role.ROBOT else None
 
     def take_report(self, now: float, scope: ReportScope = ReportScope.ALL) -> Report:
@@ -355,13 +355,13 @@ class Engine:
 
     @property
     def service_mappings(self) -> tuple[ServiceMapping, ...]:
-        """The mapping in force."""
+        """Return the mapping in force."""
         return tuple(self.mapping.services.values())
 
     # -- the links' events ----------------------------------------------------------------------------------------
 
     def on_link_event(self, event: LinkEvent, now: float) -> None:
-        """Take what a link saw."""
+        """Take an event of a link."""
         match event:
             case FragmentsReceived(path, session, fragments):
                 if self._is_current(path, session):
@@ -389,7 +389,7 @@ class Engine:
             case PathMtuChanged(path, max_datagram) if self._knows(path):
                 self.routes.set_max_datagram(path, max_datagram)
             case FinishedLost() | PathMeasured() | PathMtuChanged():
-                pass  # of a peer that left, or an interface that went, a moment ago
+                pass  # of a peer that has just left, or an interface that has just gone
             case PeerRestarted():
                 if self.peers.restarted(event, now):
                     self._forget_session(event.peer, now)
@@ -410,14 +410,14 @@ class Engine:
         self._after_news(now)
 
     def on_decoded(self, decoding: Decoding, now: float) -> None:
-        """A message is computed (`decoding.run_slice` says when)."""
+        """Take a message whose decoding is complete (`decoding.run_slice` says when)."""
         arrived = self._inbound.take_decoded(decoding)
         if arrived is not None:
             self._on_message(decoding.path, *arrived, now)
             self._after_news(now)
 
     def on_decoding_failed(self, decoding: Decoding) -> None:
-        """A message can not be computed."""
+        """Give up a message that cannot be decoded."""
         self._inbound.forgo_decoding(decoding)
 
     def _after_news(self, now: float) -> None:
@@ -429,7 +429,7 @@ class Engine:
         self.stats.in_flight = self._requests.unanswered + self._serving.running
 
     def _use_room(self, now: float) -> None:
-        """Less is under way than before."""
+        """Send what waits for room, since less is under way than before."""
         self._requests.on_room(now)
         self._serving.on_room(now)
         self.revocations.on_room(now)
@@ -480,7 +480,7 @@ class Engine:
             self._goodbyes.is_back(path.peer)
             self._backlog.add_steps(self._outbox.on_path_up(path), now)
             self._inbound.on_path_up(path)
-            if self._requests.unanswered:  # they wait: the other paths may be back as well, and share them
+            if self._requests.unanswered:  # the other paths may be back as well, and share what waits
                 self._seek(frozenset((path.peer,)))
         elif state is PathState.DOWN and not self.routes.reaches(path.peer):
             self._drop_unlisted((path.peer,), now)
@@ -494,7 +494,7 @@ class Engine:
         return path.peer in self.peers and path.interface in self._interfaces
 
     def _drop_unlisted(self, dark: Iterable[NodeName], now: float) -> None:
-        """The last path to each of these peers died, and it may have been kept for its paths only."""
+        """Drop those of these peers, whose last path died, that were kept for their paths only."""
         dropped: dict[NodeName, SessionId | None] = {}
         for name in dark:
             session = self.peers.session(name)
@@ -509,7 +509,7 @@ class Engine:
         self._commands.append((None, SetPeers(self.peers.for_links())))
 
     def _on_peer_closed(self, name: NodeName, now: float) -> None:
-        """It said goodbye: nothing new goes there; the control plane will say the same."""
+        """Send nothing new to a peer that said goodbye; the control plane will remove it as well."""
         for route in self.routes.all_to(name):
             self.routes.set_state(route.id, PathState.DOWN)
         self._backlog.add_steps(
@@ -525,7 +525,7 @@ class Engine:
         self._drop_unlisted((name,), now)
 
     def _forget_session(self, name: NodeName, now: float, *, may_return: SessionId | None = None) -> None:
-        """`may_return`: it was only silent for long, and may be back with this session, for its answers."""
+        """End a peer's session; with `may_return` it only fell silent, and may come back with it for its answers."""
         if may_return is not None and self._config.role is Role.CLOUD:
             self._away[name] = may_return
             if len(self._away) > MAX_PEERS:
@@ -551,7 +551,7 @@ class Engine:
                 steps: list[Step] = []
                 if isinstance(event, WithdrawService):
                     steps += self._requests.withdraw(event.name, event.reason)
-                steps.append(partial(self._tell, event))  # what waits at a service ends before the service does
+                steps.append(partial(self._tell, event))  # requests that wait at a service end before the service does
                 self._backlog.add(steps.copy, now)
             gained = self._offers.take_gained()
             if gained:
@@ -563,7 +563,7 @@ class Engine:
     # -- time -----------------------------------------------------------------------------------------------------
 
     def next_timer(self) -> float:
-        """When `handle_timer` is wanted next."""
+        """Return when to call `handle_timer` next."""
         timers = (
             self._backlog.next_timer(),
             self._requests.next_timer(),
@@ -573,7 +573,7 @@ class Engine:
         return min((self._sweep_at, self.revocations.next_timer(), *(timer for timer in timers if timer is not None)))
 
     def handle_timer(self, now: float) -> None:
-        """Do what is due by now, or as much of it as one turn has room for."""
+        """Do what is due now, as much of it as one turn has room for."""
         self._backlog.begin_turn(now)
         self._backlog.run(now, leave=SLICE // 2)  # deadlines must not wait until all is done
         self._requests.handle_timer(now)

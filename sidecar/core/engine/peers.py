@@ -1,13 +1,13 @@
-"""The peers this sidecar may talk to: the control plane's view, corrected by what the paths themselves prove.
+"""Holds the peers this sidecar may talk to: the control plane's view, corrected by what the paths themselves prove.
 
 A peer is known by its credential, which this sidecar judges itself (`OwnSession.admit`): one whose credential is bad
-is no peer, whatever the control plane says. It is kept for later judgements all the same: a clock that is set right or
-a new CA may prove it good, and the control plane, to which the view is in force, does not send it again. The addresses
-of a peer are those that it signed itself (`announced.py`).
+is no peer, whatever the control plane says. It is still kept for later judgements: a corrected clock or a new CA may
+prove it good, and the control plane, for which the view is in force, does not send it again. The addresses of a peer
+are those that it signed itself (`announced.py`).
 
 A peer that merely vanished from the view (its lease ran out, or the control plane restarted with an empty registry)
 is kept while a path to it lives: a dead control plane must not cost a request. One that left, was revoked or is kept
-away by the access policy goes at once; so does every one that vanished when the policy changes, since nobody said what
+away by the access policy goes at once. So does every vanished peer when the policy changes, since nobody has said what
 it may do under the new one.
 """
 
@@ -37,8 +37,8 @@ if TYPE_CHECKING:
     from sidecar.core.seam.links import PeerRenewed, PeerRestarted
 
 RESTART_GAP_S = 1.0
-"""A peer that restarts more often is not believed: every restart costs all links work. What it costs to look at the
-credentials of those who say so has a budget of its own (`verification_budget.py`)."""
+"""A peer that restarts more often is not believed: every restart costs all links work. The cost of verifying
+credentials that claim a restart has a budget of its own (`verification_budget.py`)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,11 +48,11 @@ class Refusal:
     peer: Peer
     why: str
     cause: str
-    """The same for as long as it is refused for the same: `why` may tell the seconds."""
+    """Stays the same while the cause does: `why` may contain seconds that change."""
 
     @staticmethod
     def of(peer: Peer, error: DecodeError) -> Refusal:
-        """Return what to note when `error` is what came of judging the peer."""
+        """Return the refusal of a peer whose judgement raised `error`."""
         return Refusal(peer, str(error), error.reason if isinstance(error, CertificateError) else str(error))
 
 
@@ -64,17 +64,17 @@ class Peers:
         self._dropped = dropped
         self._known: dict[NodeName, Peer] = {}
         self._keys: dict[NodeName, PairKeys] = {}
-        """What is shared with each of them."""
+        """Keys shared with each peer."""
         self.refused: dict[NodeName, Refusal] = {}
-        """Of the view, so no more than `MAX_PEERS`."""
+        """Refused peers of the view, so no more than `MAX_PEERS`."""
         self._announced = Announced(own, dropped)
         self._unlisted: set[NodeName] = set()
         self._told: dict[NodeName, tuple[Peer, PairKeys, LinkPeer]] = {}
-        """What links were told of each, and what that was made of."""
+        """What links were told about each peer, and what that was made from."""
         self._restarted_at: dict[NodeName, float] = {}
         self._budget = VerificationBudget()
         self._policy = NO_POLICY
-        """Fingerprint of the access policy that was judged by last."""
+        """Fingerprint of the last access policy applied."""
         self.version = Version(0)
 
     def __contains__(self, name: object) -> bool:
@@ -93,7 +93,7 @@ class Peers:
         return list(self._known.values())
 
     def apply(self, peer_set: PeerSet, reaches: Callable[[NodeName], bool]) -> str | None:
-        """Take a new view; returns why it is refused, or None. `reaches` tells whether a path to a peer lives."""
+        """Take a new view; return why it is refused, or None. `reaches` returns whether a path to a peer lives."""
         if len(peer_set.peers) > MAX_PEERS:
             return f"{len(peer_set.peers)} peers, the limit is {MAX_PEERS}"
         gone = {removed.name for removed in peer_set.removed if removed.reason is not RemovalReason.LEASE_EXPIRED}
@@ -107,7 +107,7 @@ class Peers:
                 known[peer.name] = self._at_announced(peer, listed)
             except DecodeError as error:
                 refused[peer.name] = Refusal.of(peer, error)
-        # Not of the refused: what they say is nobody's but the control plane's.
+        # Refused peers do not count: only the control plane vouches for their sessions.
         sessions = {peer.session for peer in known.values()}
         if len(sessions) != len(known):
             return "two peers share a session"
@@ -134,16 +134,16 @@ class Peers:
 
     @property
     def ignored_candidates(self) -> dict[NodeName, str]:
-        """Peers of which the view tells addresses that are not used, and why."""
+        """Return the peers whose addresses in the view are not used, and why."""
         return self._announced.ignored
 
     def _at_announced(self, peer: Peer, told: Peer) -> Peer:
-        """The peer at the addresses to use, now that `told` is told of it."""
+        """Return the peer with the addresses to use, now that the view describes it as `told`."""
         candidates = self._announced.candidates_of(told)
         return peer if candidates == peer.candidates else dataclasses.replace(peer, candidates=candidates)
 
     def _newer(self, listed: Peer) -> Peer:
-        """The view may be older than what the peer itself proved by its introduction."""
+        """Return the newer of a listed peer and what it proved by its introduction: the view may be older."""
         known = self._known.get(listed.name)
         if known is None or known.token != listed.token or known.credential == listed.credential:
             return listed
@@ -176,7 +176,7 @@ class Peers:
         return True
 
     def renewed(self, event: PeerRenewed, now: float) -> bool:
-        """Take the credential of a peer's session signed anew; False when it is not proven, or ends no later."""
+        """Take a renewed credential of a peer's session; False when it is not proven, or ends no later."""
         name, credential = event.peer, event.credential
         peer = self._known.get(name)
         if peer is None or (peer.session, peer.incarnation) != (credential.session, credential.incarnation):
@@ -187,12 +187,12 @@ class Peers:
             return False
         if self._keys[name] == keys and self._ends_at(renewed) > self._ends_at(peer):
             return True
-        # Of another session key, which our paths do not have, or the one before: a copy of an old introduction.
+        # It has another session key, which our paths lack, or is the earlier one: a copy of an old introduction.
         self._known[name], self._keys[name] = peer, keys
         return False
 
     def _introduced(self, peer: Peer, now: float, *, at_home: bool) -> bool:
-        """Take what a peer proves of itself; False when it does not, or when its credential is not looked at now."""
+        """Take a peer that proves itself; False when it does not, or when its credential is not verified now."""
         if not self._own.has_admitted(peer.credential) and not self._budget.take(peer.name, now, at_home=at_home):
             self._dropped["verifications_full"] += 1
             return False
@@ -205,17 +205,17 @@ class Peers:
         return True
 
     def _ends_at(self, peer: Peer) -> float:
-        """When its credential ends (seconds since 1970): never was good, if it is bad."""
+        """Return when its credential ends (seconds since 1970); minus infinity if it is bad."""
         with contextlib.suppress(DecodeError):
             self._own.admit(peer)
         return self._own.ends_at(peer.credential)
 
     def condemn(self, session: SessionId) -> None:
-        """Whatever its credential: this session is not talked to any more, see `recheck`."""
+        """Refuse this session from now on, whatever its credential; see `recheck`."""
         self._own.condemn(session)
 
     def recheck(self) -> list[NodeName]:
-        """Whom to trust has changed; returns those that are no peers any more. See `OwnSession.forget_admitted`."""
+        """Judge all peers again after a change of trust; return those dropped. See `OwnSession.forget_admitted`."""
         gone = []
         for name, peer in list(self._known.items()):
             try:
@@ -229,16 +229,16 @@ class Peers:
         return gone
 
     def all_refused(self) -> list[Peer]:
-        """Return the refused peers: another time of day or new trust may prove them good."""
+        """Return the refused peers: a corrected clock or new trust may prove them good."""
         return [refusal.peer for refusal in self.refused.values()]
 
     def readmit(self, judged: Iterable[Peer]) -> list[NodeName]:
-        """Of the refused, these were judged good a moment ago (`OwnSession.admit`); returns those now taken."""
+        """Take refused peers that have just been judged good (`OwnSession.admit`); return those taken."""
         taken = []
         sessions = {peer.session for peer in self._known.values()}
         for peer in judged:
             refusal = self.refused.get(peer.name)
-            # Not when a newer view came meanwhile, nor with a session that another has taken since.
+            # Skip it if a newer view came meanwhile, or another peer has taken its session since.
             if refusal is None or refusal.peer is not peer or peer.session in sessions:
                 continue
             if len(self._known) >= MAX_PEERS:
@@ -259,14 +259,14 @@ class Peers:
         del self._known[name], self._keys[name]
 
     def drop_if_unlisted(self, name: NodeName) -> bool:
-        """The last path to a peer died: True when that ends it, because the view no longer lists it."""
+        """Drop a peer whose last path died if the view no longer lists it; return whether it was dropped."""
         if name not in self._unlisted:
             return False
         self._forget(name)
         return True
 
     def may_call(self, name: NodeName, service: ServiceName) -> bool:
-        """Cloud: whether the control plane lets this robot call the service here; not if it is unknown."""
+        """Cloud: return whether the control plane lets this robot call the service here; False if it is unknown."""
         peer = self._known.get(name)
         return peer is not None and service in peer.may_call
 

@@ -1,13 +1,13 @@
 """Passes revocation lists on from sidecar to sidecar, so that a dead control plane withholds none.
 
-Who holds which lists is told by their numbers, whenever a peer comes within reach or we have others: a few dozen bytes.
-Who has an older one asks, one peer after the other, and is sent what there is. Nothing is sent to who did not ask, so
-that the lists that a control plane passes to a whole fleet do not travel a second time over every path, and nothing is
-taken but as the answer to a question: what a member that tells tales costs is one question, and one look at what it
-answers, each time with twice the pause before the next.
+A sidecar tells each peer that comes within reach the numbers of the lists it holds, and all peers when its lists
+change: a few dozen bytes. A sidecar with an older list asks, one peer after the other, and is sent what there is.
+Nothing is sent unasked, so that lists that a control plane passes to a whole fleet do not travel a second time over
+every path. Nothing is taken except as the answer to a question: a lying member costs one question and one look at its
+answer, each time with twice the pause before the next.
 
-What comes is PEM that nobody has judged yet. The CA's signature is looked at outside, where everything that is taken
-comes back in by `set_own`.
+What arrives is PEM that nobody has judged yet. The CA's signature is checked outside; all lists that are accepted come
+back in through `set_own`.
 """
 
 from __future__ import annotations
@@ -30,28 +30,28 @@ if TYPE_CHECKING:
     from sidecar.core.wire.messages import Encoded, RevocationMessage
 
 ASK_AFTER_S = 0.5
-"""From hearing of a newer list until we ask for it: the control plane's own copy may be on its way."""
+"""Time between hearing of a newer list and asking for it: the control plane's own copy may be on its way."""
 ASK_NEXT_AFTER_S = 5.0
-"""Between two questions, whomever they go to: a list of thousands of entries takes as long over a slow path."""
+"""Least time between two questions, to any peers: a list of thousands of entries takes as long over a slow path."""
 ASK_AGAIN_S = 30.0
-"""Before the same peer is asked again, twice as long each time that it was of no use."""
+"""Time before the same peer is asked again, doubled each time that it was of no use."""
 MAX_ASK_AGAIN_S = 3600.0
 MAX_DOUBLINGS = 16
 AWAIT_S = 120.0
-"""A list is taken from whom we asked, for so long."""
+"""Time for which a list is taken from a peer that we asked."""
 SEND_AGAIN_S = 20.0
-"""Before a peer is sent the same lists again, twice as long each time: less than it waits before it asks again."""
+"""Time before a peer is sent the same lists again, doubled each time: less than it waits before it asks again."""
 MAX_REMEMBERED = 4096
-"""Peers of which is known what they hold, were asked and sent, also beyond a session's end: who restarts often shall
-not be asked, or sent to, more often. As many as there can be peers; whoever has been known longest is forgotten."""
+"""Peers whose holdings, questions and sendings are remembered, also after their session ends: a peer that restarts
+often must not be asked, or sent to, more often. As many as there can be peers; the one known longest is forgotten."""
 MAX_SENDING_BYTES = 4 * 1024 * 1024
-"""Lists under way to all peers together; who asked beyond that waits for its turn."""
+"""Most bytes of lists under way to all peers together; peers that ask beyond that wait for their turn."""
 TOLD_AT_ONCE = 64
-"""Peers told of our lists in one turn, which has the engine's lock: less than a millisecond."""
+"""Peers told about our lists in one turn, which holds the engine's lock: less than a millisecond."""
 TELL_EVERY_S = 0.01
-"""Between two such turns: 4,096 peers are told in under a second."""
+"""Interval of such turns: 4,096 peers are told in under a second."""
 LIFETIME_S = 120.0
-"""Of a message on its way."""
+"""Lifetime of a message on its way."""
 EXCHANGES = ("asked", "sent", "received", "taken")
 """The keys of `EngineStats.revocations`."""
 NEVER = float("inf")
@@ -61,7 +61,7 @@ K = TypeVar("K")
 
 @dataclass(slots=True)
 class _Source:
-    """What a peer says it holds, and how often we asked it in vain."""
+    """The lists a peer says it holds, and how often we asked it in vain."""
 
     numbers: Mapping[int, int] = field(default_factory=dict)
     asked: int = 0
@@ -71,7 +71,7 @@ class _Source:
 
 @dataclass(slots=True)
 class _Sent:
-    """What a peer was sent."""
+    """The lists a peer was sent."""
 
     version: int = -1
     times: int = 0
@@ -79,22 +79,22 @@ class _Sent:
 
 
 class RevocationExchange:
-    """What is told, asked and sent; the engine's peers feed it, and every table has at most as many entries."""
+    """Tells, asks and sends; the engine's peers feed it, and no table has more entries than there can be peers."""
 
     def __init__(self, routes: Routes, outbox: Outbox, stats: EngineStats) -> None:
         self._routes = routes
         self._outbox = outbox
         self._stats = stats
         self._own: Mapping[int, int] = {}
-        """Number of the newest list by CA, for each CA that is believed here; -1: there is none."""
+        """CA -> number of its newest list, for each CA that is trusted here; -1: there is none."""
         self._lists: bytes = b""
         self._version = 0
-        """Counts our changes of lists."""
+        """Number of times our lists have changed."""
         self._sources: dict[NodeName, _Source] = {}
         self._sent: dict[NodeName, _Sent] = {}
         self._untold: dict[NodeName, None] = {}
         self._waiting: dict[NodeName, None] = {}
-        """Who asked and was not sent any yet."""
+        """Peers that asked and were not sent any lists yet."""
         self._sending: list[OutboundMessage] = []
         self._tell_at = NEVER
         self._ask_at = NEVER
@@ -103,9 +103,9 @@ class RevocationExchange:
     # -- from outside ---------------------------------------------------------------------------------------------
 
     def set_own(self, numbers: Mapping[int, int], pem: bytes, now: float) -> None:
-        """We hold these lists now, all of them judged; `numbers` by CA, -1 for one that has none.
+        """Replace the lists we hold, all of them judged; `numbers` by CA, -1 for one that has none.
 
-        `pem`: empty where they are too long to pass on.
+        `pem` is empty if they are too long to pass on.
         """
         if dict(numbers) == self._own:
             return
@@ -120,7 +120,7 @@ class RevocationExchange:
         self._ask_at = self._next_question(now)
 
     def on_judged(self, peer: NodeName, now: float, *, good: bool) -> None:
-        """What this peer sent is taken (and comes by `set_own`), or is no list of our CAs."""
+        """Note that this peer's lists were accepted (and come through `set_own`), or are no lists of our CAs."""
         if good:
             self._stats.revocations["taken"] += 1
             return
@@ -130,21 +130,21 @@ class RevocationExchange:
             source.asked, source.ask_at = MAX_DOUBLINGS, now + MAX_ASK_AGAIN_S
 
     def take_arrived(self) -> list[tuple[NodeName, bytes]]:
-        """Return what peers sent since the last call, PEM that is to be judged, and who did."""
+        """Return the peers that sent lists since the last call, each with its PEM, which is to be judged."""
         arrived, self._arrived = self._arrived, []
         return arrived
 
     # -- from the engine ------------------------------------------------------------------------------------------
 
     def on_reached(self, peer: NodeName, now: float) -> None:
-        """There is a path to a peer."""
+        """Tell a peer that came within reach about our lists."""
         if not self._lists:
             return
         self._untold[peer] = None
         self._tell_at = min(self._tell_at, now)
 
     def forget_peer(self, peer: NodeName) -> None:
-        """The peer's session is over."""
+        """Forget what belongs to a peer's session that is over."""
         self._untold.pop(peer, None)
         self._waiting.pop(peer, None)
         source = self._sources.get(peer)
@@ -152,7 +152,7 @@ class RevocationExchange:
             source.numbers, source.await_until = {}, -NEVER
 
     def on_message(self, peer: NodeName, message: RevocationMessage, now: float) -> None:
-        """Take what a peer says."""
+        """Take a peer's message."""
         match message:
             case RevocationsHeld(numbers):
                 source = _kept(self._sources, peer, _Source)
@@ -165,18 +165,18 @@ class RevocationExchange:
                 self._on_lists(peer, pem, now)
 
     def next_timer(self) -> float:
-        """When `handle_timer` is wanted next."""
+        """Return when to call `handle_timer` next."""
         return min(self._tell_at, self._ask_at)
 
     def handle_timer(self, now: float) -> None:
-        """Do what is due by now."""
+        """Do what is due now."""
         if now >= self._tell_at:
             self._tell(now)
         if now >= self._ask_at:
             self._ask(now)
 
     def on_room(self, now: float) -> None:
-        """Less is under way than before."""
+        """Send waiting lists, since less is under way than before."""
         if self._waiting:
             self._send_lists(now)
 
@@ -201,7 +201,7 @@ class RevocationExchange:
         return max(now, min(times)) if times else NEVER
 
     def _ask(self, now: float) -> None:
-        """Ask whom we asked in vain the least."""
+        """Ask the peer that we have asked in vain least often."""
         ready = [
             (source.asked, source.ask_at, peer)
             for peer, source in self._sources.items()
@@ -230,7 +230,7 @@ class RevocationExchange:
 
     def _on_wanted(self, peer: NodeName, numbers: Mapping[int, int], now: float) -> None:
         if not self._lists or all(number <= numbers.get(ca, -1) for ca, number in self._own.items()):
-            return  # it has them by now
+            return  # it has them already
         sent = _kept(self._sent, peer, _Sent)
         if sent.version == self._version and now < sent.again_at:
             self._stats.dropped["revocations_asked_too_often"] += 1
@@ -263,13 +263,13 @@ class RevocationExchange:
     def _send(self, peer: NodeName, content: Encoded, now: float) -> OutboundMessage | None:
         path = self._routes.best_to(peer)
         if path is None:
-            return None  # when there is one, the peer is told, and asked, again
+            return None  # when there is one, the peer is told and asked again
         ends_at = now + LIFETIME_S
         return self._outbox.send(path, content, priority=Priority.LOW, deadline=ends_at, expires=ends_at)
 
 
 def _kept(table: dict[NodeName, K], peer: NodeName, new: Callable[[], K]) -> K:
-    """Return the peer's entry, which may be a new one in place of the oldest."""
+    """Return the peer's entry, created in place of the oldest one if the table is full."""
     if peer not in table:
         if len(table) >= MAX_REMEMBERED:
             del table[next(iter(table))]
