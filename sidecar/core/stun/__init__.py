@@ -1,1 +1,1 @@
-"""The STUN client (RFC 8489). Stands by itself."""
+"""Implements the STUN client (RFC 8489). Stands by itself."""

@@ -1,9 +1,9 @@
-"""STUN client (RFC 8489 Binding): learns how the world sees one local UDP socket. Sans-IO.
+"""Learns the server-reflexive addresses of one local UDP socket by STUN (RFC 8489 Binding). Sans-IO.
 
-IPv4 and IPv6 are learnt independently. Within a family one server is asked; when it is slow the next one is
-asked as well, and the first answer wins. The server that answered stays the preferred one, so that a NAT
-which maps each destination differently does not look like one that changes its mind. A learnt mapping is
-refreshed for ever, a failed round is repeated for ever with backoff.
+IPv4 and IPv6 are learned independently. Within a family one server is asked; when it is slow the next one is
+asked as well, and the first answer wins. The server that answered stays the preferred one, so that a NAT with
+destination-dependent mappings does not look like one that changes its mapping. A mapping is refreshed, and a
+failed round repeated with backoff, without end.
 """
 
 from __future__ import annotations
@@ -25,30 +25,30 @@ if TYPE_CHECKING:
     from sidecar.core.stun.events import StunEvent
 
 MAX_SERVERS_PER_FAMILY = 4
-"""Servers used of those a control plane names; the others are ignored and counted."""
+"""Servers used of those that a control plane names; the others are ignored and counted."""
 
 
 class StunView(NamedTuple):
-    """What is known of one family at one moment."""
+    """What is known about one family at one moment."""
 
     family: int
     mapping: Address | None
     server: Address | None
-    """Which answered last."""
+    """The server that answered last."""
     answered_at: float | None
-    """When (monotonic, s)."""
+    """When it answered (monotonic, s)."""
     changes: int
-    """How often the mapping became another."""
+    """Number of times the mapping changed."""
     problem: str
-    """Why the last round failed; empty: it did not."""
+    """Why the last round failed; empty if it did not."""
 
 
 class StunClient:
     """Learns the server-reflexive address of one socket, per family.
 
-    `servers` are numeric addresses in canonical form, asked in order; raises ValueError for a host name.
-    `rng` draws transaction ids: pass random.SystemRandom outside tests, since an id is what keeps strangers
-    from forging answers. STUN datagrams not believed are counted into `drops`, by StunDrop.
+    `servers` are numeric addresses in canonical form, asked in order; a host name raises ValueError.
+    `rng` draws transaction ids: pass random.SystemRandom outside tests, since only the id keeps strangers
+    from forging answers. STUN datagrams that are not believed are counted in `drops`, by StunDrop.
     """
 
     def __init__(
@@ -70,21 +70,21 @@ class StunClient:
 
     @property
     def drops(self) -> Counter[str]:
-        """STUN datagrams not believed, by StunDrop."""
+        """Return the number of STUN datagrams not believed, by StunDrop."""
         return self._outbox.drops
 
     @property
     def requests_sent(self) -> int:
-        """Requests handed out for sending, repetitions included."""
+        """Return the number of requests handed out for sending, including retransmissions."""
         return self._outbox.requests_sent
 
     @property
     def events_lost(self) -> int:
-        """Events dropped because the driver did not fetch them."""
+        """Return the number of events dropped because the driver did not fetch them."""
         return self._outbox.events_lost
 
     def set_servers(self, servers: Iterable[Address], now: float) -> None:
-        """Ask these from now on; families whose servers stay the same are left undisturbed."""
+        """Ask these servers from now on; families whose servers stay the same are left undisturbed."""
         before = {family: client.servers for family, client in self._families.items()}
         self._set_servers(servers)
         for family, client in self._families.items():
@@ -92,27 +92,27 @@ class StunClient:
                 client.start(now)
 
     def start(self, now: float) -> None:
-        """Ask at once; also to be called when the interface's address or link changed.
+        """Ask at once; call it also when the interface's address or link has changed.
 
-        The answer is told as an event even if it is the same as before.
+        The answer is reported as an event even if it is the same as before.
         """
         for client in self._families.values():
             client.start(now)
 
     def mapping(self, family: int) -> Address | None:
-        """The mapping last learnt for family 4 or 6."""
+        """Return the mapping last learned for family 4 or 6."""
         client = self._families.get(family)
         return client.mapping if client else None
 
     def views(self) -> list[StunView]:
-        """Return what is known of each family; any thread may ask."""
+        """Return what is known about each family; any thread may ask."""
         return [
             StunView(family, one.mapping, one.preferred, one.answered_at, one.changes, one.problem)
             for family, one in list(self._families.items())
         ]
 
     def receive_datagram(self, data: bytes | memoryview, addr: Address, now: float) -> bool:
-        """Take a datagram of the socket; True if it was STUN, believed or counted."""
+        """Take a datagram of the socket; return True if it was STUN, believed or counted."""
         if not is_stun(data):
             return False
         try:
@@ -132,16 +132,16 @@ class StunClient:
         return True
 
     def handle_timer(self, now: float) -> None:
-        """Do what is due; to be called at next_timer()."""
+        """Do what is due; call it at next_timer()."""
         for client in self._families.values():
             client.handle_timer(now)
 
     def next_timer(self) -> float | None:
-        """When handle_timer wants to be called; None before start or without servers."""
+        """Return when to call handle_timer; None before start or without servers."""
         return min((t for c in self._families.values() if (t := c.next_timer()) is not None), default=None)
 
     def datagrams_to_send(self) -> list[tuple[bytes, Address]]:
-        """Take what is to be sent over the socket now."""
+        """Take the datagrams to send over the socket now."""
         sending, self._outbox.sending = self._outbox.sending, []
         return sending
 

@@ -1,4 +1,4 @@
-"""What the STUN client tells its driver, and what it counts."""
+"""Defines what the STUN client tells its driver, and what it counts."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class Mapped:
-    """The socket is seen as `address`: for the first time, or again after a failure.
+    """The socket is seen as `address`: for the first time, or again after a failure or a start.
 
-    `family` (4 or 6) is that of the server asked; `address` may be of the other one behind a NAT64.
+    `family` (4 or 6) is that of the server asked; behind a NAT64 `address` may be of the other one.
     """
 
     family: int
@@ -24,7 +24,7 @@ class Mapped:
 
 @dataclass(frozen=True, slots=True)
 class MappingChanged:
-    """The NAT gave the socket another address: `previous` is no longer of use to peers."""
+    """The NAT gave the socket another address: `previous` is useless to peers now."""
 
     family: int
     address: Address
@@ -37,7 +37,7 @@ class Failed:
     """No server of this family answered; asking goes on in the background.
 
     `last_known` is the mapping until now. A refresh also fails when only the servers are gone, so it may
-    well still hold: whether to use it is for the driver to say.
+    well still hold; the driver decides whether to use it.
     """
 
     family: int

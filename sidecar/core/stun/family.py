@@ -1,4 +1,4 @@
-"""STUN client for one address family: which server is asked when, and what is believed. Sans-IO."""
+"""Runs the STUN client for one address family: decides which server to ask when, and what to believe. Sans-IO."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from protos.model.ids import Address
 
 MAX_QUEUED_EVENTS = 64
-"""Events kept for a driver that does not fetch them; the oldest goes first and is counted."""
+"""Events kept for a driver that does not fetch them; the oldest is dropped first, and counted."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -28,16 +28,16 @@ class StunClientConfig:
     retransmission: Retransmission = field(default_factory=Retransmission)
 
     stagger_s: float = 2.0
-    """Silence of one server before the next one is asked beside it: three requests unanswered."""
+    """Silence of one server before the next one is asked as well: three requests unanswered."""
 
     refresh_s: float = 15.0
-    """How often a mapping is checked; short of the 30 s that brief NAT bindings last, so it keeps them."""
+    """Interval of checks of a mapping; below the 30 s that short NAT bindings last, so it keeps them alive."""
 
     retry_s: float = 1.0
     """First wait after a round in which no server answered; doubles with each further one."""
 
     max_retry_s: float = 30.0
-    """Longest wait between failed rounds: a server back up is found within this plus the jitter."""
+    """Longest wait between failed rounds: a server that is back up is found within this plus the jitter."""
 
     jitter: float = 0.25
     """Share by which waits vary, so that a fleet does not ask in step."""
@@ -50,7 +50,7 @@ class StunClientConfig:
 
 
 class StunOutbox:
-    """What the families of one socket share: datagrams to send, events, counters."""
+    """State that the families of one socket share: datagrams to send, events, counters."""
 
     def __init__(self, drops: Counter[str]) -> None:
         self.sending: list[tuple[bytes, Address]] = []
@@ -89,9 +89,9 @@ class StunFamilyClient:
         self.answered_at: float | None = None
         """When a server last answered (s)."""
         self.changes = 0
-        """How often the mapping became another."""
+        """Number of times the mapping changed."""
         self.problem = ""
-        """Why the last round failed; empty: it did not."""
+        """Why the last round failed; empty if it did not."""
         self._family = family
         self._outbox = outbox
         self._rng = rng
@@ -107,22 +107,22 @@ class StunFamilyClient:
         self._transactions: list[StunTransaction] = []
 
     def start(self, now: float) -> None:
-        """Ask at once, forgetting what is under way but not the mapping; the answer is told even if it is the same."""
+        """Ask at once, dropping requests under way but not the mapping; report the answer even if it is the same."""
         self._failed_rounds = 0
         self._announced = False
         self._start_round(now)
 
     @property
     def preferred(self) -> Address | None:
-        """The server that answered last."""
+        """Return the server that answered last."""
         return self._preferred
 
     def find(self, transaction_id: bytes) -> StunTransaction | None:
-        """The transaction under way that has this id."""
+        """Return the transaction under way with this id."""
         return next((t for t in self._transactions if t.transaction_id == transaction_id), None)
 
     def next_timer(self) -> float | None:
-        """When handle_timer wants to be called."""
+        """Return when to call handle_timer."""
         timers = [t.deadline for t in self._transactions]
         timers += [t for t in (self._next_round, self._next_server) if t is not None]
         return min(timers, default=None)
@@ -180,7 +180,7 @@ class StunFamilyClient:
         self._next_round = None
         self._transactions.clear()
         self._reason = ""
-        # The sort is stable: the configured order holds behind the preferred server.
+        # The sort is stable: the other servers keep the configured order behind the preferred one.
         self._waiting = deque(sorted(self.servers, key=lambda server: server != self._preferred))
         self._ask_next_server(now)
 
@@ -204,7 +204,7 @@ class StunFamilyClient:
             self._outbox.emit(Failed(self._family, self._reason, self.mapping))
             self._announced = False
             wait_s = min(self._config.retry_s * 2.0**self._failed_rounds, self._config.max_retry_s)
-            # Capped: the exponent would overflow a float after a week of failures.
+            # Capped: without it the power would overflow a float after a week of failures.
             self._failed_rounds = min(self._failed_rounds + 1, 32)
             self._end_round(now, wait_s)
 
@@ -216,7 +216,7 @@ class StunFamilyClient:
 
 
 def _is_usable(address: Address) -> bool:
-    """Whether a peer could send to it at all; a server's word is not enough."""
+    """Return whether a peer could send to it at all; a server's word is not enough."""
     ip = ip_address(address[0])
     return address[1] != 0 and not ip.is_unspecified and not ip.is_multicast
 

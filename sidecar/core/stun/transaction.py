@@ -1,4 +1,4 @@
-"""One STUN request to one server over UDP: when to send it, when to give it up (RFC 8489 section 6.2.1)."""
+"""Times one STUN request to one server over UDP: when to send it, when to give it up (RFC 8489 section 6.2.1)."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ class Retransmission:
     """RTO: wait after the first request; doubles with each further one."""
 
     max_requests: int = 7
-    """Rc: requests sent in all."""
+    """Rc: number of requests sent in all."""
 
     last_wait_factor: float = 16.0
     """Rm: wait after the last request, in multiples of the initial RTO."""
@@ -55,15 +55,15 @@ class StunTransaction:
         self.request = encode(StunMessage(MessageClass.REQUEST, transaction_id, software=software, fingerprint=True))
         self.requests_sent = 0
         self.deadline = now
-        """When handle_timer has something to do next; the first request is due at once."""
+        """When to call handle_timer next; the first request is due at once."""
         self._retransmission = retransmission
         self._rto_s = retransmission.initial_rto_s
 
     def handle_timer(self, now: float) -> bool:
-        """Count one more request as sent and tell so; False when all have been sent and waited for.
+        """Count one more request as sent and return True; return False when all were sent and waited for.
 
-        To be called at `deadline` or later. After a pause longer than the schedule (a suspended machine) the
-        waits start from now: a burst of overdue copies would tell nothing that one does not.
+        Call it at `deadline` or later. After a pause longer than the schedule (a suspended machine) the waits
+        start from now: a burst of overdue copies would tell no more than one.
         """
         if self.requests_sent >= self._retransmission.max_requests:
             return False
