@@ -1,1 +1,1 @@
-"""The sidecar's end of the control stream, and over which way it is reached. Imports `base`."""
+"""Implements the sidecar's end of the control stream, and chooses the way to the control plane. Imports `base`."""

@@ -1,4 +1,4 @@
-"""How long to wait before the next attempt: exponential backoff with full jitter."""
+"""Decides how long to wait before the next attempt, by exponential backoff with full jitter."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ if TYPE_CHECKING:
 
 
 class Backoff:
-    """Delays drawn evenly from 0 to a bound that doubles from `first_s` up to `max_s`.
+    """Delays drawn uniformly from 0 to a bound that doubles from `first_s` up to `max_s`.
 
     Full jitter: after an outage a fleet comes back spread out, not in waves.
     """
@@ -27,14 +27,14 @@ class Backoff:
         return delay_s
 
     def set_max(self, max_s: float) -> None:
-        """From now on the bound doubles up to `max_s` only."""
+        """Let the bound double up to `max_s` only from now on."""
         self._max_s = max_s
         self._bound_s = min(self._bound_s, max_s)
 
     def reset(self) -> None:
-        """The last attempt went well."""
+        """Start again from the first bound, as the last attempt went well."""
         self._bound_s = self._first_s
 
     def exhaust(self) -> None:
-        """Trying again soon is of no use: continue from the largest bound."""
+        """Continue from the largest bound, as trying again soon is useless."""
         self._bound_s = self._max_s

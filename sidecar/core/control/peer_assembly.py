@@ -1,4 +1,4 @@
-"""Makes whole sets of what the control stream says of the peers: of changes, and of sets in several messages."""
+"""Assembles whole sets of peers from the control stream's changes and from sets in several messages."""
 
 from __future__ import annotations
 
@@ -11,35 +11,35 @@ from protos.model.peer_changes import put_upon
 
 
 class PeerAssembly:
-    """The peers of one sidecar, put together; `peers` is the set in force, None if there is none, or none is known."""
+    """Assembles the peers of one sidecar; `peers` is the set in force, None if there is none or none is known."""
 
     def __init__(self, peers: PeerSet | None) -> None:
         self._version = Version(0) if peers is None else peers.version
         self._held = {} if peers is None else {peer.name: peer for peer in peers.peers}
         self._begun: PeerSet | None = None
-        """The messages so far of a set of which more is to come."""
+        """The messages so far of an incomplete set."""
         self._left_out: int | None = None
-        """The nonce of a set of which a message was refused: what still comes of it is no set."""
+        """The nonce of a set of which a message was refused: its further messages are ignored."""
 
     def begin_stream(self) -> None:
-        """What was begun on the stream before does not go on."""
+        """Drop the set begun on the stream before: it does not go on."""
         self._begun = None
         self._left_out = None
 
     def leave_out(self, nonce: int) -> None:
-        """A message of this set could not be read: the set is refused."""
+        """Refuse a set of which a message could not be read."""
         self._begun = None
         self._left_out = nonce
 
     def take(self, message: PeerSet) -> PeerSet | None:
-        """Take a message; returns what all messages of its set say together, None until the last one is here.
+        """Take a message; return all messages of its set merged, None until the last one is here.
 
-        A set that is too large is returned as it is so far: `whole` refuses it.
+        A set that is too large is returned as far as it has come: `whole` refuses it.
         """
         if message.nonce == self._left_out:
             return None
         begun, self._begun = self._begun, None
-        # Another set instead: the control plane has dropped the one it had begun.
+        # Otherwise it belongs to another set: the control plane has dropped the one it had begun.
         if begun is not None and _set_of(begun) == _set_of(message):
             message = replace(message, peers=(*begun.peers, *message.peers), removed=(*begun.removed, *message.removed))
         if len(message.peers) > MAX_PEERS or len(message.removed) > MAX_PEERS:
@@ -51,14 +51,13 @@ class PeerAssembly:
         return message
 
     def is_upon(self, said: PeerSet) -> bool:
-        """Whether this is a whole set, or changes upon the one in force."""
+        """Return whether this is a whole set, or changes to the one in force."""
         return said.base in (0, self._version)
 
     def whole(self, said: PeerSet) -> PeerSet | str:
-        """Return the whole set that this leads to, or why there is none.
+        """Return the whole set that this results in, or why there is none.
 
-        A set, whatever number of messages it comes in, names nobody twice: neither as a peer, nor as removed, nor as
-        both.
+        A set, in however many messages it comes, names no peer twice: not as a peer, not as removed, not as both.
         """
         if len(said.peers) > MAX_PEERS or len(said.removed) > MAX_PEERS:
             return f"more than {MAX_PEERS} peers"
@@ -74,7 +73,7 @@ class PeerAssembly:
         return whole if len(whole.peers) <= MAX_PEERS else f"more than {MAX_PEERS} peers"
 
     def in_force(self, whole: PeerSet) -> None:
-        """This set is what changes are upon from now on."""
+        """Make this set the base of changes from now on."""
         self._version = whole.version
         self._held = {peer.name: peer for peer in whole.peers}
 

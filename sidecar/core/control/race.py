@@ -1,8 +1,8 @@
-"""Connecting to the control plane over several ways, the good ones first; the first that connects wins. Sans-IO.
+"""Races connections to the control plane over several ways, good ones first; the first to connect wins. Sans-IO.
 
-Happy Eyeballs (RFC 8305) over interfaces and addresses: within a class of ways one attempt after the other, STAGGER_S
-apart, or at once when the one before has failed. A class begins when the one before has had its head start, or all of
-it has failed.
+This is Happy Eyeballs (RFC 8305) over interfaces and addresses. Within a class of ways one attempt starts after the
+other, STAGGER_S apart, or at once when the one before has failed. A class begins when the one before has had its head
+start, or all of it has failed.
 """
 
 from __future__ import annotations
@@ -18,10 +18,10 @@ if TYPE_CHECKING:
 
 
 class ControlRace:
-    """One race. The driver starts what is `due`, and says what came of it."""
+    """One race. The driver starts the attempts that are `due`, and reports their outcomes."""
 
     def __init__(self, classes: Sequence[WayClass], now: float, running: Collection[Way] = ()) -> None:
-        """`running`: attempts of a race before, which go on."""
+        """Begin a race; `running` are attempts of an earlier race, which go on."""
         self._waiting = [[way for way in one.ways if way not in running] for one in classes]
         self._head_starts = [one.head_start_s for one in classes]
         self._running = set(running)
@@ -34,7 +34,7 @@ class ControlRace:
 
     @property
     def over(self) -> bool:
-        """Whether every way has failed."""
+        """Return whether every way has failed."""
         return not self._running and not any(self._waiting)
 
     def due(self, now: float) -> list[Way]:
@@ -50,7 +50,7 @@ class ControlRace:
         return started
 
     def failed(self, way: Way, why: str, now: float) -> None:
-        """The attempt is over; the next one need not wait."""
+        """Note a failed attempt; the next one need not wait."""
         self._running.discard(way)
         self.failures[way] = why
         for index, ways in enumerate(self._classes):
@@ -60,7 +60,7 @@ class ControlRace:
                     self._begin_next(index, now)
 
     def _begin_next(self, index: int, now: float) -> None:
-        """A class has failed: those behind it come sooner."""
+        """Bring the later classes forward, as a class has failed."""
         following = next((later for later in range(index + 1, len(self._due)) if self._waiting[later]), None)
         if following is not None:
             sooner = self._due[following] - now
@@ -69,11 +69,11 @@ class ControlRace:
                     self._due[later] -= sooner
 
     def next_timer(self) -> float | None:
-        """When something is due; None: nothing but the end of what runs is awaited."""
+        """Return when something is due; None if only running attempts are awaited."""
         return min((due for due, waiting in zip(self._due, self._waiting, strict=True) if waiting), default=None)
 
     def outcome(self) -> str:
-        """What came of every way so far, in words."""
+        """Return the outcome of every way so far, in words."""
         told = [f"{way}: {why}" for way, why in self.failures.items() if way not in self._running]
         told += [f"{way}: no answer" for way in sorted(self._running, key=str)]
         return "; ".join(told) or "there is no way to it"

@@ -1,14 +1,14 @@
-"""The sidecar's end of the control stream: what to say, what to believe, when to try again. Sans-IO.
+"""Implements the sidecar's end of the control stream: what to say, what to believe, when to try again. Sans-IO.
 
     OFFLINE ──(retry_at: open a stream)──▶ REGISTERING ──(Welcome)──▶ ONLINE
        ▲                                       │                        │
        └───────(stream ended, no Welcome)──────┴────────────────────────┘
 
-The rules are xDS's. A resource comes with a version and a nonce; the answer repeats the nonce with the version that is
-then in force. Only the newest answer for each resource matters, since the control plane ignores stale nonces: so what
-waits to be sent is bounded without any queue. Which of two versions is older matters within one stream alone: whatever
-a control plane has said, the next one begins with whatever version it likes. A mapping comes whole. Peers come whole or
-as changes, and in one message or several: what is put in force is whole (`PeerAssembly`).
+The rules are those of xDS. A resource comes with a version and a nonce; the answer repeats the nonce with the version
+that is then in force. Only the newest answer for each resource matters, since the control plane ignores stale nonces:
+so what waits to be sent is bounded without any queue. Versions are ordered only within one stream: the next control
+plane may begin with any version. A mapping comes whole. Peers come whole or as changes, in one message or several; what
+is put in force is whole (`PeerAssembly`).
 """
 
 from __future__ import annotations
@@ -38,42 +38,44 @@ RETRY_FIRST_S = 0.2
 """First bound of the delay before a new stream: a restarted control plane is back within about a second."""
 
 RETRY_MAX_S = 10.0
-"""Largest bound: the load of a fleet that waits, against how long a control plane that is back goes unnoticed."""
+"""Largest bound: a compromise between the load of a waiting fleet and the time to notice that the control plane is
+back."""
 
 RETRY_LEAST_S = 1.0
-"""From one attempt to the next, at least, when a change of the network is the reason for it."""
+"""Least time between two attempts when a change of the network is the reason for the second."""
 
 WELCOME_TIMEOUT_S = 5.0
 """A stream without Welcome for this long is given up: connection set-up over a bad cellular link takes 1 to 2 s."""
 
 WELCOME_TIMEOUT_MAX_S = 35.0
-"""Each one given up makes the next wait twice as long, up to this: a fleet that starts all at once takes longer than
-the first timeout, and who gives up and begins anew has had its turn for nothing."""
+"""Each stream given up doubles the next wait, up to this: a fleet that starts all at once takes longer than the first
+timeout, and a sidecar that gives up and starts again has wasted its turn."""
 
 PATIENCE_TIMES = 3.0
-"""So many times as long as the attempts of its fleet may be apart a sidecar waits beside that. From 1,500 sidecars on
-they are closer together than would let all in."""
+"""A sidecar waits in addition this many times as long as the attempts of its fleet may be apart. From 1,500 sidecars on
+the attempts are too close together to let all in."""
 
 STABLE_AFTER_S = 5.0
-"""A stream this old ended for a new reason: the backoff starts anew."""
+"""A stream this old ended for a new reason: the backoff starts again."""
 
 HEARTBEATS_PER_LEASE = 3.0
-"""Two may get lost before the lease ends."""
+"""Heartbeats per lease: two may get lost before it ends."""
 
 URGENT_PART, URGENT_LEAST_S = 0.1, 0.1
-"""What is urgent is reported so soon after what was urgent before: a part of the interval, and at least so much."""
+"""Least time between two urgent reports: this share of the interval, and at least this many seconds."""
 
 PERHAPS_UNTOLD_S = 15.0
-"""What was urgent so shortly before a stream is told again: the one before may have been dead already, unnoticed."""
+"""Urgent news no older than this at the start of a stream is reported again: the stream before may have been dead
+already, unnoticed."""
 
 MIN_INTERVAL_S = 0.05
-"""Floor of what the control plane may ask for: it must not be able to make the sidecar spin."""
+"""Shortest interval that the control plane may ask for: it must not be able to make the sidecar spin."""
 
 _NOTHING_MEASURED = Report()
 
 
 class ControlState(enum.Enum):
-    """Where the control stream stands."""
+    """State of the control stream."""
 
     OFFLINE = "offline"
     REGISTERING = "registering"
@@ -82,43 +84,44 @@ class ControlState(enum.Enum):
 
 @dataclass(slots=True)
 class ControlStats:
-    """What happened on the control stream."""
+    """Counters of the control stream."""
 
     attempts: int = 0
     streams: int = 0
     """Streams that got their Welcome."""
     reports: int = 0
     reports_dropped: int = 0
-    """Collected, but the stream ended first; one already handed to the stream may get lost with it uncounted."""
+    """Reports collected but not sent before the stream ended; one already handed to it may get lost uncounted."""
     heartbeats: int = 0
     acks: Counter[ResourceKind] = field(default_factory=Counter)
     nacks: Counter[ResourceKind] = field(default_factory=Counter)
     ignored: Counter[str] = field(default_factory=Counter)
-    """Messages of the control plane not acted on, by reason."""
+    """Messages of the control plane that were not acted on, by reason."""
     connections: Counter[str] = field(default_factory=Counter)
-    """TCP connections that a stream took, by interface."""
+    """TCP connections that streams used, by interface."""
     connections_left: Counter[str] = field(default_factory=Counter)
-    """Those that were left for another way, by cause."""
+    """Connections that were left for another way, by cause."""
     dial_drops: Counter[str] = field(default_factory=Counter)
-    """What the dialer left out or turned away, by reason."""
+    """Addresses left out and connections turned away by the dialer, by reason."""
 
 
 @dataclass(frozen=True, slots=True)
 class Apply:
-    """Put this resource in force, then call `ControlSession.applied`."""
+    """A resource for the driver to put in force, after which it calls `ControlSession.applied`."""
 
     resource: ResourceKind
     content: PeerSet | MappingSet
 
 
 ControlEvent = Welcome | Apply
-"""What a received message asks of the driver."""
+"""Task that a received message sets the driver."""
 
 
 class ControlSession:
     """One sidecar's dialogue with the control plane, over however many streams.
 
-    `registration` names the versions already in force, such as those loaded from disk, `peers` the set of that version.
+    `registration` names the versions already in force, such as those loaded from disk; `peers` is the set of that
+    version.
     """
 
     def __init__(self, registration: Registration, rng: random.Random, peers: PeerSet | None = None) -> None:
@@ -132,20 +135,20 @@ class ControlSession:
         """The newest version that was acknowledged on this stream."""
         self._backoff = Backoff(rng, first_s=RETRY_FIRST_S, max_s=RETRY_MAX_S)
         self._registered_with = b""
-        """The credential that this stream's registration named."""
+        """The credential in this stream's registration."""
         self._candidates = CandidateSet()
         self._services = ServiceSet()
         self._revocations = NO_REVOCATIONS
         self._draining = False
         self.refused: Apply | None = None
-        """The newest mapping, if it could not be put in force: it may fit when interfaces or peers are others."""
+        """The newest mapping, if it could not be put in force: it may fit when interfaces or peers have changed."""
         self.state = ControlState.OFFLINE
         self.stats = ControlStats()
         self._retry_at = 0.0
         self._patience_s = WELCOME_TIMEOUT_S
-        """For how long a stream may be without Welcome, ..."""
+        """Time (s) that a stream may be without Welcome ..."""
         self._first_patience_s = WELCOME_TIMEOUT_S
-        """... and the first one after the last Welcome or change of the network."""
+        """... and that of the first stream after the last Welcome or change of the network."""
         self._opened_at = 0.0
         self._refused = False
         self._heartbeat_interval_s = 0.0
@@ -153,12 +156,12 @@ class ControlSession:
         self._reported_at = 0.0
         self._urgent_at = -math.inf
         self._urgent = False
-        """Whether the next whole report is."""
+        """Whether the next whole report is urgent."""
         self._urgent_told_at = -math.inf
         self._changes_at = math.inf
-        """When to tell of changes alone."""
+        """When to report changes alone."""
         self._told_whole = False
-        """Whether this stream has had a whole report: to a control plane that knows nothing, changes say little."""
+        """Whether this stream has had a whole report: changes tell little to a control plane that knows nothing."""
         self._heartbeat_at = 0.0
         self._report_at = 0.0
         self._clear_outgoing()
@@ -175,23 +178,23 @@ class ControlSession:
 
     @property
     def retry_at(self) -> float:
-        """When to open the next stream; of meaning while offline."""
+        """Return when to open the next stream; meaningful only while offline."""
         return self._retry_at
 
     def version(self, resource: ResourceKind) -> Version:
-        """The version in force; 0 means none."""
+        """Return the version in force; 0 means none."""
         return self._in_force[resource]
 
     def set_credential(self, credential: bytes) -> None:
-        """What the next registration says of us: the session's credential, signed anew.
+        """Use the session's renewed credential in the next registration.
 
-        The driver ends the present stream for it. That one is sent no more addresses: they are signed with the new
-        certificate now, and the control plane would relay them beside the old credential, as a forger does.
+        The driver ends the present stream for it. That stream gets no more addresses: they are now signed with the new
+        certificate, and the control plane would relay them with the old credential, as a forger does.
         """
         self._registration = replace(self._registration, credential=credential)
 
     def not_restored(self, held: Apply) -> None:
-        """What the registration said we hold could not be put in force: it is asked for anew."""
+        """Ask again for a resource that the registration claims but that could not be put in force."""
         self._in_force[held.resource] = Version(0)
         if held.resource is ResourceKind.PEERS:
             self._assembly = PeerAssembly(None)
@@ -200,7 +203,7 @@ class ControlSession:
     # ── the stream ──
 
     def opened(self, now: float) -> None:
-        """A stream is being opened: everything is said anew on it."""
+        """Begin a stream: everything is said again on it."""
         self._clear_outgoing()
         self._taken.clear()
         self._changes_at, self._told_whole = math.inf, False
@@ -215,10 +218,10 @@ class ControlSession:
         self._drain_due = self._draining
 
     def closed(self, now: float, *, refused: bool = False, moved: bool = False) -> float:
-        """The stream ended, or never came to be; returns the seconds until the next attempt.
+        """Note that the stream ended, or could not be opened; return the seconds until the next attempt.
 
-        `refused`: by the control plane's decision, which will hardly change within a second. `moved`: by ours, since
-        there is a better way to it, which is taken at once.
+        `refused`: the control plane decided it, and will hardly change its mind within a second. `moved`: we decided
+        it, since there is a better way, which is taken at once.
         """
         if self.state is ControlState.ONLINE and now - self._opened_at >= STABLE_AFTER_S:
             self._backoff.reset()
@@ -236,9 +239,9 @@ class ControlSession:
         return delay_s
 
     def network_changed(self, now: float) -> None:
-        """An attempt may succeed that could not a moment ago: the next one comes soon, though not in step with others.
+        """Try again soon, though not in step with others, as an attempt may succeed that could not before.
 
-        Not if the control plane refuses us; nor more often than once in RETRY_LEAST_S, however often networks change.
+        Do not if the control plane refuses us, nor more often than once in RETRY_LEAST_S however often networks change.
         """
         if self.state is ControlState.OFFLINE and not self._refused:
             self._backoff.reset()
@@ -249,7 +252,7 @@ class ControlSession:
     # ── from the control plane ──
 
     def receive(self, message: ControlMessage, now: float) -> ControlEvent | None:
-        """Take a message of the current stream; returns what the driver has to do about it."""
+        """Take a message of the current stream; return what the driver has to do about it."""
         match message:
             case Welcome():
                 return self._receive_welcome(message, now)
@@ -292,7 +295,7 @@ class ControlSession:
         return Apply(ResourceKind.PEERS, whole)
 
     def _is_news(self, resource: ResourceKind, content: PeerSet | MappingSet) -> bool:
-        """Whether this is to be put in force; if not, it is answered."""
+        """Return whether to put this in force; answer it if not."""
         if content.version == self._in_force[resource]:
             self.stats.ignored[f"{resource.value}_repeated"] += 1
             self._ack(resource, content.nonce)
@@ -305,7 +308,7 @@ class ControlSession:
         return True
 
     def applied(self, apply: Apply, error: str | None) -> None:
-        """The driver put the resource in force, or could not because of `error`."""
+        """Answer a resource that the driver put in force, or could not because of `error`."""
         self._keep_if_refused(apply, refused=error is not None)
         if error is not None:
             self._nack(apply.resource, apply.content.nonce, error)
@@ -313,7 +316,7 @@ class ControlSession:
         self._in_force[apply.resource] = apply.content.version
         if isinstance(apply.content, PeerSet):
             self._assembly.in_force(apply.content)
-            # A control plane that has just started believes what is said of a server only once that is back, too.
+            # A control plane that has just started believes reports about a server only once that is back, too.
             self._report_at = min(self._report_at, self._soonest_report())
         self._ack(apply.resource, apply.content.nonce)
 
@@ -322,15 +325,15 @@ class ControlSession:
             self.refused = apply if refused else None
 
     def applied_late(self) -> None:
-        """The driver put in force what was `refused`.
+        """Note that the driver put in force what was `refused`.
 
-        The control plane is not told: for it a refused version stays refused, and it sends what it wants in force
-        again. So the version in force stays here too, and whatever comes is newer.
+        The control plane is not told: it considers a refused version refused, and sends again what it wants in force.
+        So the version in force stays the same here, too, and whatever comes is newer.
         """
         self.refused = None
 
     def undecodable(self, resource: ResourceKind | None, nonce: int, error: str) -> None:
-        """A message broke its format; `resource` and `nonce` as far as they could be read."""
+        """Refuse a malformed message; `resource` and `nonce` are what could be read of it."""
         self.stats.ignored["undecodable"] += 1
         if resource is ResourceKind.PEERS:
             self._assembly.leave_out(nonce)
@@ -338,7 +341,7 @@ class ControlSession:
             self._nack(resource, nonce, error)
 
     def unknown(self) -> int:
-        """A message was left out that only a newer sidecar knows; returns how many were."""
+        """Count a message that only a newer sidecar knows; return how many were left out."""
         self.stats.ignored["unknown_kind"] += 1
         return self.stats.ignored["unknown_kind"]
 
@@ -354,19 +357,19 @@ class ControlSession:
     # ── from the sidecar ──
 
     def set_candidates(self, candidates: CandidateSet) -> None:
-        """Replace what is said of our addresses."""
+        """Replace the addresses that we announce."""
         if candidates != self._candidates:
             self._candidates = candidates
             self._candidates_due = self.state is not ControlState.OFFLINE
 
     def set_services(self, services: ServiceSet) -> None:
-        """Replace what is said of our services."""
+        """Replace the services that we announce."""
         if services != self._services:
             self._services = services
             self._services_due = self.state is not ControlState.OFFLINE
 
     def set_revocations(self, held: RevocationSet) -> None:
-        """Replace what is said of the revocation lists in use."""
+        """Replace the revocation lists that we announce as in use."""
         if held != self._revocations:
             self._revocations = held
             self._revocations_due = self.state is not ControlState.OFFLINE
@@ -378,7 +381,7 @@ class ControlSession:
             self._drain_due = self.state is not ControlState.OFFLINE
 
     def report_due(self, now: float) -> ReportScope | None:
-        """What the driver is to collect and pass to `send_report`."""
+        """Return what the driver has to collect and pass to `send_report` now."""
         if self.state is not ControlState.ONLINE or self._report is not None:
             return None
         if now >= self._report_at:
@@ -386,11 +389,11 @@ class ControlSession:
         return ReportScope.CHANGES if now >= self._changes_at else None
 
     def report_at_once(self, now: float, scope: ReportScope) -> None:
-        """Something happened that cannot wait for the interval: a path went, or a deadline was missed.
+        """Report what cannot wait for the interval: a path changed, or a deadline was missed.
 
-        The fleet's size counts all the same, as it may happen to all again and again: two of these reports are a tenth
-        of the interval apart.
-        Without a stream it waits for the next one.
+        The fleet's size still counts, as this may happen to all repeatedly: two such reports are at least a tenth of
+        the interval apart.
+        Without a stream the report waits for the next one.
         """
         self._urgent_at = now
         soonest = max(now, self._soonest_report())
@@ -404,7 +407,7 @@ class ControlSession:
         return self._urgent_told_at + max(self._report_interval_s * URGENT_PART, URGENT_LEAST_S)
 
     def send_report(self, report: Report, now: float) -> None:
-        """Send what was measured since the last report; one that holds nothing is left out."""
+        """Send what was measured since the last report; an empty report is left out."""
         self._reported_at, self._changes_at = now, math.inf
         if report.changes_only:
             self._urgent_told_at = now
@@ -419,7 +422,7 @@ class ControlSession:
     # ── time ──
 
     def next_timer(self) -> float:
-        """When `handle_timer` (offline: a new stream) is due."""
+        """Return when `handle_timer` (offline: a new stream) is due."""
         match self.state:
             case ControlState.OFFLINE:
                 return self._retry_at
@@ -434,13 +437,13 @@ class ControlSession:
             self._heartbeat_due = True
 
     def welcome_overdue(self, now: float) -> bool:
-        """Whether the stream is to be given up."""
+        """Return whether to give the stream up for lack of a Welcome."""
         return self.state is ControlState.REGISTERING and now >= self._opened_at + self._patience_s
 
     # ── to the control plane ──
 
     def messages_to_send(self, now: float) -> list[SidecarMessage]:
-        """Return what is to be sent on the current stream, in order."""
+        """Return the messages to send on the current stream, in order."""
         messages: list[SidecarMessage] = []
         if self._register_due:
             messages.append(self._current_registration())

@@ -1,11 +1,11 @@
-"""Watches the connection that carries the control stream: is it to be left for another way? Sans-IO.
+"""Watches the connection that carries the control stream, and decides when to leave it for another way. Sans-IO.
 
-It is, when what was sent over it stays unacknowledged while another interface may lead there; sooner when the data
-plane, whose paths are probed all the time, hears nobody over this interface either but does over another. Whatever the
-data plane says, a connection that is acknowledged stays: some networks let nothing through but TCP. With a single
+A connection is left when what was sent over it stays unacknowledged while another interface may lead there; sooner when
+the data plane, whose paths are probed all the time, hears nobody over this interface either but does over another.
+Whatever the data plane says, a connection that is acknowledged stays: some networks let only TCP through. With a single
 interface nothing is gained by leaving: TCP and gRPC give up in their own time.
 
-It is also to be left when its interface is gone, and when a cheaper one is well again.
+It is also left when its interface is gone, and when a cheaper one is well again.
 """
 
 from __future__ import annotations
@@ -20,52 +20,53 @@ if TYPE_CHECKING:
     from sidecar.core.control.ways import ControlWays, Way
 
 SILENT_S = 1.0
-"""Unacknowledged for so long, while the data plane hears somebody over another interface."""
+"""Time without acknowledgement to leave after, while the data plane hears somebody over another interface."""
 SILENT_WITHOUT_NEWS_S = 3.0
-"""While of the other interfaces nothing is known: one may lead nowhere, and a stall of a cellular link is cheaper."""
+"""The same while nothing is known about the other interfaces: they may lead nowhere, and a stall of a cellular link
+costs less."""
 CONFIRMED_S = 0.25
-"""While the data plane does not hear anybody over this interface either."""
+"""The same while the data plane hears nobody over this interface either."""
 ROUND_TRIPS = 3.0
-"""No silence is shorter than so many of the connection's round trips, at their worst."""
+"""The same in worst-case round trips of the connection: none of these times is shorter."""
 DOUBT_S = 0.15
-"""Then the data plane is asked to find out now, whatever its paths have to do."""
+"""Time without acknowledgement after which the data plane is asked to probe now, however busy its paths are."""
 LOOK_S = 0.25
-"""While something is unacknowledged, the kernel is asked this often."""
+"""Interval of asking the kernel while something is unacknowledged."""
 KEEPALIVE_S = 1
-"""A connection that says nothing is asked for an acknowledgement after so long, the least that Linux knows, and as
-often: by kernels, so that it costs neither end a turn of Python."""
+"""Time (s) after which an idle connection is asked for an acknowledgement, and interval of asking: the least that Linux
+allows. Kernels do it, so that it costs neither end a turn of Python."""
 LIVED_S = 60.0
-"""A connection that lived so long proves its interface."""
+"""Lifetime of a connection that proves its interface."""
 
 SILENT, GONE, CHEAPER = LEAVE_CAUSES = ("silent", "gone", "cheaper")
 
 
 @dataclass(frozen=True, slots=True)
 class Seen:
-    """What the kernel says of the connection."""
+    """State of the connection, from the kernel."""
 
     unacked: bool
-    """Whether something sent, if only by the kernel to ask for it, is not acknowledged yet."""
+    """Whether something sent, if only the kernel's keepalive, is not acknowledged yet."""
     quiet_s: float
-    """Since the last acknowledgement or data."""
+    """Time since the last acknowledgement or data."""
     rtt_s: float
     """The longest round trip to be expected."""
 
 
 @dataclass(frozen=True, slots=True)
 class Leave:
-    """The connection is to be left."""
+    """The decision to leave the connection."""
 
     cause: str
     """SILENT, GONE or CHEAPER."""
     reason: str
-    """In words."""
+    """The cause in words."""
     to: tuple[Way, ...] = ()
-    """Only for one of these."""
+    """The only ways to leave for; empty: any."""
 
 
 class ControlWatch:
-    """One connection, from its first byte on. `over` is the interface that it takes, as far as it is known."""
+    """Watches one connection from its first byte on. `over` is the interface that it takes, if known."""
 
     def __init__(self, ways: ControlWays, way: Way, over: InterfaceName | None, now: float) -> None:
         self._ways = ways
@@ -80,17 +81,17 @@ class ControlWatch:
 
     @property
     def over(self) -> InterfaceName | None:
-        """The interface that it takes."""
+        """Return the interface that it takes."""
         return self._over
 
     def sent(self, now: float) -> None:
-        """Something that wants an acknowledgement was sent."""
+        """Note that something was sent that needs an acknowledgement."""
         if self._waiting_since is None:
             self._waiting_since = now
             self._look_at = now + DOUBT_S
 
     def saw(self, seen: Seen, now: float) -> None:
-        """The kernel was asked."""
+        """Take the kernel's answer."""
         heard_at = now - seen.quiet_s
         self._rtt_s = seen.rtt_s
         self._look_at = now + LOOK_S
@@ -106,7 +107,7 @@ class ControlWatch:
             self._ways.held_well(self._over)
 
     def take_doubt(self, now: float) -> InterfaceName | None:
-        """The interface whose paths are to be probed now, once for each silence."""
+        """Return the interface whose paths have to be probed now, once for each silence."""
         if self._waiting_since is None or self._doubted_at >= self._waiting_since:
             return None
         if now < self._waiting_since + max(DOUBT_S, self._rtt_s) or self._ways.another(self._over, now) is None:
@@ -115,7 +116,7 @@ class ControlWatch:
         return self._over
 
     def judge(self, now: float) -> Leave | None:
-        """Whether to leave it now; call `saw` first."""
+        """Return the decision to leave it now, or None; call `saw` first."""
         over = self._over
         if over is not None and not self._ways.has(over):
             return Leave(GONE, f"{over} carries nothing any more")
@@ -128,7 +129,7 @@ class ControlWatch:
         return None
 
     def _limit_s(self, now: float) -> float | None:
-        """How long something may be unacknowledged; None: as long as TCP likes."""
+        """Return how long (s) something may be unacknowledged; None: as long as TCP allows."""
         another = self._ways.another(self._over, now)
         if another is None:
             return None
@@ -139,7 +140,7 @@ class ControlWatch:
         return max(shortest, ROUND_TRIPS * self._rtt_s)
 
     def next_timer(self, now: float) -> float | None:
-        """When to ask the kernel and to `judge`, unless something is sent or the network changes."""
+        """Return when to ask the kernel and to `judge`, unless something is sent or the network changes."""
         times = [self._ways.next_better(self._over, now)]
         if self._waiting_since is not None:
             times.append(self._look_at)

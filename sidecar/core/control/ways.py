@@ -1,11 +1,11 @@
-"""The ways to the control plane, an interface and an address each, and in which order to try them. Sans-IO.
+"""Orders the ways to the control plane, each an interface and an address, in which to try them. Sans-IO.
 
     first     the cheapest interfaces, then dearer ones; within a price in the order of the interfaces
-    then      interfaces over which the data plane hears nobody any more, and ways that failed a moment ago
-    at last   no interface at all: the routing table decides, as for every other program
+    then      interfaces over which the data plane hears nobody any more, and ways that failed recently
+    last      no interface at all: the routing table decides, as for every other program
 
-What a way costs and whether its interface lives is all that is known beforehand. Whether it leads to the control plane
-is found out by connecting (`control_race`), whether it still does by watching what is sent (`control_watch`).
+Only the cost of a way and whether its interface lives are known beforehand. Whether it leads to the control plane is
+found out by connecting (`race.py`), whether it still does by watching what is sent (`watch.py`).
 """
 
 from __future__ import annotations
@@ -24,31 +24,31 @@ if TYPE_CHECKING:
     from protos.model.ids import Address, InterfaceName
 
 MAX_STATES = 256
-"""Interfaces whose past is remembered, as many as the data plane has numbers for."""
+"""Interfaces whose history is remembered, as many as the data plane has numbers for."""
 MAX_ADDRESSES = 16
 """Addresses of the control plane that are tried: eight names of two families."""
 
 FAILED_FIRST_S, FAILED_MAX_S = 10.0, 300.0
-"""A way that connects but leads to no control plane (a captive portal, say) goes to the end of the order for so long:
-longer with each time, so that it does not cost an attempt at every turn."""
+"""Time (s) for which a way that connects but leads to no control plane (a captive portal, say) goes to the end of the
+order: longer each time, so that it does not cost an attempt at every turn."""
 
 STAGGER_S = 0.25
-"""From one attempt to the next (RFC 8305 section 8, Connection Attempt Delay)."""
+"""Time between attempts (RFC 8305 section 8, Connection Attempt Delay)."""
 
 HEAD_START_S, LIVING_HEAD_START_S = 0.5, 1.0
-"""What the cheaper interfaces have over the dearer ones: longer when the data plane hears somebody over them. Both
-leave time to be back within two seconds."""
+"""Head start of cheaper interfaces over dearer ones: longer when the data plane hears somebody over them. Both leave
+time to be back within two seconds."""
 
 WELL_S, MAX_WELL_S = 15.0, 600.0
-"""A cheaper interface takes the stream back when it has been well for so long; twice that for each time that a stream
-over it had to be given up."""
+"""A cheaper interface takes the stream back when it has been well for this long, doubled each time that a stream over
+it had to be given up."""
 
 DIAL_DROPS = (ADDRESSES_FULL, STRANGER) = ("addresses_full", "stranger")
-"""What is counted: addresses of the control plane beyond MAX_ADDRESSES; who else connects to gRPC's line."""
+"""Counters: addresses of the control plane beyond MAX_ADDRESSES; strangers that connect to gRPC's line."""
 
 
 class Life(enum.Enum):
-    """What the data plane knows of an interface."""
+    """State of an interface, as the data plane knows it."""
 
     LIVING = "living"
     """Some path over it is up."""
@@ -59,12 +59,12 @@ class Life(enum.Enum):
 
 
 class Price(NamedTuple):
-    """What the control stream costs over an interface; the smaller is preferred."""
+    """Cost of the control stream over an interface; the smaller is preferred."""
 
     billed: bool = False
     """Whether its bytes are counted."""
     charge: float = 0.0
-    """What a request over it costs, as the best guess of what else would."""
+    """Cost of a request over it, the best guess of the cost of other traffic."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,19 +73,19 @@ class ControlInterface:
 
     name: InterfaceName
     addresses: frozenset[str]
-    """Its own."""
+    """The interface's own addresses."""
     price: Price
 
     def reaches(self, address: Address) -> bool:
-        """Whether it has an address of this family."""
+        """Return whether it has an address of this one's family."""
         return any((":" in own) == (":" in address[0]) for own in self.addresses)
 
 
 class Way(NamedTuple):
-    """How to connect."""
+    """A way to connect."""
 
     interface: InterfaceName | None
-    """To be bound to; None: as the routing table says."""
+    """The interface to bind to; None: the routing table decides."""
     address: Address
 
     def __str__(self) -> str:
@@ -96,11 +96,11 @@ class Way(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class WayClass:
-    """Ways that are as good as each other, in the order in which to try them."""
+    """Equally good ways, in the order in which to try them."""
 
     ways: tuple[Way, ...]
     head_start_s: float
-    """How much later the next class begins, unless all of these have failed."""
+    """Time (s) by which the next class begins later, unless all of these have failed."""
 
 
 @dataclass(slots=True)
@@ -117,19 +117,19 @@ class _Failure:
 
 
 class ControlWays:
-    """What is known of the ways."""
+    """Everything known about the ways."""
 
     def __init__(self, drops: Counter[str]) -> None:
-        """`drops` counts what is left out."""
+        """Start without ways; `drops` counts what is left out."""
         self._drops = drops
         self._interfaces: dict[InterfaceName, ControlInterface] = {}
         self._addresses: tuple[Address, ...] = ()
         self._states: dict[InterfaceName, _InterfaceState] = {}
-        """Of those that are away as well: who comes back has not earned more trust by it."""
+        """States of all interfaces, also those that are away: coming back earns no more trust."""
         self._paths: Mapping[InterfaceName, PathState] = {}
         self._failures: dict[Way, _Failure] = {}
         self._silent: dict[Way, float] = {}
-        """Until when each way is avoided that fell silent."""
+        """Way that fell silent -> until when it is avoided."""
         self._proven: Way | None = None
         self.can_bind = True
         """Whether the system lets us bind to an interface."""
@@ -137,7 +137,7 @@ class ControlWays:
     # -- what is told ---------------------------------------------------------------------------------------------
 
     def set_interfaces(self, interfaces: Sequence[ControlInterface], now: float) -> None:
-        """These can carry something now, in this order."""
+        """Replace the interfaces that can carry something now, in order."""
         before = self._interfaces
         self._interfaces = {interface.name: interface for interface in interfaces}
         if len(self._states) > MAX_STATES:
@@ -150,7 +150,7 @@ class ControlWays:
         self._prune()
 
     def set_addresses(self, addresses: Iterable[Address]) -> None:
-        """Where the control plane is, in the order of preference."""
+        """Replace the addresses of the control plane, in the order of preference."""
         unique = list(dict.fromkeys(addresses))
         if len(unique) > MAX_ADDRESSES:
             self._drops[ADDRESSES_FULL] += len(unique) - MAX_ADDRESSES
@@ -158,7 +158,7 @@ class ControlWays:
         self._prune()
 
     def set_paths(self, best: Mapping[InterfaceName, PathState], now: float) -> None:
-        """The best state of the data plane's paths over each interface that has some."""
+        """Replace the best state of the data plane's paths over each interface that has some."""
         self._paths = best
         for name in self._interfaces:
             state = self._states[name]
@@ -175,7 +175,7 @@ class ControlWays:
                     self._silent = {way: until for way, until in self._silent.items() if way.interface != name}
 
     def failed(self, way: Way, now: float, *, whole_address: bool = False) -> None:
-        """It led to no control plane; `whole_address`: whatever the interface."""
+        """Note a way that led to no control plane; `whole_address`: over any interface."""
         address = way.address
         for one in self._ways():
             if one == way or (whole_address and one.address == address):
@@ -184,24 +184,24 @@ class ControlWays:
                 self._failures[one] = _Failure(now + pause_s, pause_s)
 
     def fell_silent(self, way: Way, over: InterfaceName | None, now: float) -> None:
-        """A connection over it had to be left: avoided for a while, or until its interface is heard again."""
+        """Avoid a way whose connection had to be left, for a while or until its interface is heard again."""
         self._silent[way] = now + FAILED_FIRST_S
         self.disappointed(over)
 
     def proven(self, way: Way) -> None:
-        """A control plane let us in at its other end."""
+        """Note that a control plane registered us over this way."""
         self._failures.pop(way, None)
         self._silent.pop(way, None)
         self._proven = way
 
     def disappointed(self, name: InterfaceName | None) -> None:
-        """What went over it had to be given up: the next time it must be well for longer."""
+        """Note that a connection over it had to be given up: the next time it must be well for longer."""
         state = None if name is None else self._states.get(name)
         if state is not None:
             state.well_s = min(2.0 * state.well_s, MAX_WELL_S)
 
     def held_well(self, name: InterfaceName | None) -> None:
-        """A connection over it has lived for long."""
+        """Note that a connection over it has lived for long."""
         state = None if name is None else self._states.get(name)
         if state is not None:
             state.well_s = WELL_S
@@ -210,31 +210,31 @@ class ControlWays:
 
     @property
     def empty(self) -> bool:
-        """Whether no address is known."""
+        """Return whether no address is known."""
         return not self._addresses
 
     def life(self, name: InterfaceName | None) -> Life:
-        """What is known of an interface."""
+        """Return the state of an interface."""
         state = None if name is None else self._states.get(name)
         return Life.UNKNOWN if state is None else state.life
 
     def silent_since(self, name: InterfaceName | None) -> float | None:
-        """Since when the data plane hears nobody over it, while it does over another interface; None: not so."""
+        """Return since when the data plane hears nobody over it but somebody over another interface; None if not so."""
         state = None if name is None else self._states.get(name)
         if state is None or state.life is not Life.SILENT or not self._others_live(name):
             return None
         return state.since
 
     def has(self, name: InterfaceName) -> bool:
-        """Whether it can carry anything now."""
+        """Return whether it can carry anything now."""
         return name in self._interfaces
 
     def owner(self, address: str) -> InterfaceName | None:
-        """The interface whose address this is."""
+        """Return the interface that has this address."""
         return next((one.name for one in self._interfaces.values() if address in one.addresses), None)
 
     def another(self, over: InterfaceName | None, now: float) -> Life | None:
-        """What is known of the best other interface that may lead there as well; None: there is none."""
+        """Return the state of the best other interface that may lead there as well; None if there is none."""
         lives = [
             self.life(way.interface)
             for way in self._ways()
@@ -245,7 +245,7 @@ class ControlWays:
         return Life.LIVING if Life.LIVING in lives else Life.UNKNOWN
 
     def classes(self, now: float) -> list[WayClass]:
-        """All ways, the best class first."""
+        """Return all ways, the best class first."""
         good: dict[Price, list[Way]] = {}
         doubtful: list[Way] = []
         unbound: list[Way] = []
@@ -256,22 +256,22 @@ class ControlWays:
                 good.setdefault(self._interfaces[way.interface].price, []).append(way)
             else:
                 doubtful.append(way)
-        # Where the routing table leads, no other program finds fault: a way that failed comes after one that did not.
+        # Other programs accept where the routing table leads: here a way that failed comes after one that did not.
         unbound.sort(key=lambda way: self._has_failed(way, now))
         found = [WayClass(tuple(good[price]), self._head_start_s(good[price])) for price in sorted(good)]
         found += [WayClass(tuple(ways), HEAD_START_S) for ways in (doubtful, unbound) if ways]
         return found
 
     def better(self, over: InterfaceName | None, now: float) -> list[Way]:
-        """Ways over cheaper interfaces that have been well for long enough to take the stream back."""
+        """Return the ways over cheaper interfaces that have been well for long enough to take the stream back."""
         return [way for at, way in self._cheaper(over) if at <= now]
 
     def next_better(self, over: InterfaceName | None, now: float) -> float | None:
-        """When `better` has more to say, if nothing else happens."""
+        """Return when `better` will return more, if nothing else happens."""
         return min((at for at, _ in self._cheaper(over) if at > now), default=None)
 
     def _cheaper(self, over: InterfaceName | None) -> list[tuple[float, Way]]:
-        """Ways over living interfaces that cost less than this one, and when each may be taken."""
+        """Return the ways over living interfaces that cost less than this one, and when each may be taken."""
         if over is None or over not in self._interfaces:
             return []
         found = []
@@ -288,7 +288,7 @@ class ControlWays:
     # -- within ---------------------------------------------------------------------------------------------------
 
     def _ways(self) -> list[Way]:
-        """Every way there is; of addresses and of interfaces the ones that worked last come first."""
+        """Return every way; the address and the interface that worked last come first."""
         last = self._proven
         addresses = sorted(self._addresses, key=lambda address: last is None or address != last.address)
         interfaces = sorted(self._interfaces.values(), key=lambda one: last is None or one.name != last.interface)
@@ -299,7 +299,7 @@ class ControlWays:
         return ways + [Way(None, address) for address in addresses]
 
     def _is_here(self, address: Address) -> bool:
-        """Whether it is this host's: what is bound to an interface does not get there."""
+        """Return whether it is this host's: a socket bound to an interface does not get there."""
         host = address[0]
         return ip_address(host).is_loopback or self.owner(host) is not None
 
@@ -313,7 +313,7 @@ class ControlWays:
         return failure is not None and now < failure.until
 
     def _others_live(self, name: InterfaceName | None) -> bool:
-        """Whether somebody is heard over another interface: then it is not the peers that are gone."""
+        """Return whether somebody is heard over another interface: then it is not the peers that are gone."""
         return any(self._states[other].life is Life.LIVING for other in self._interfaces if other != name)
 
     def _head_start_s(self, ways: Sequence[Way]) -> float:
@@ -327,7 +327,7 @@ class ControlWays:
 
 
 def families_in_turn(addresses: Sequence[Address]) -> tuple[Address, ...]:
-    """IPv4 and IPv6 in turn (RFC 8305 section 4), the family of the first address first."""
+    """Return IPv4 and IPv6 addresses alternately (RFC 8305 section 4), the family of the first address first."""
     if not addresses:
         return ()
     first_is_v6 = ":" in addresses[0][0]
