@@ -1,1 +1,1 @@
-"""Which interfaces are ready, and when to look at them. Stands by itself."""
+"""Decides which interfaces are ready, and when to look at them. Stands by itself."""
