@@ -1,7 +1,7 @@
-"""Runs of datagrams through one UDP socket: segmentation by the kernel both ways (udp(7), UDP_SEGMENT and UDP_GRO).
+"""Moves runs of datagrams through one UDP socket by segmentation in the kernel (udp(7), UDP_SEGMENT and UDP_GRO).
 
 One system call then moves up to 64 datagrams. Where the kernel or the device has no segmentation, or refuses it later,
-datagrams go one by one; what comes one by one is laid side by side, so that the link gets runs all the same.
+datagrams are sent one by one. Datagrams that arrive one by one are laid side by side, so that the link still gets runs.
 """
 
 from __future__ import annotations
@@ -27,23 +27,24 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 ROOM_BYTES = 1 << 16
-"""Longer than the longest UDP payload and the longest run that the kernel joins: nothing is ever truncated."""
+"""Room for one call, more than the longest UDP payload and the longest run that the kernel joins: nothing is ever
+truncated."""
 ARENA_BYTES = 256 * 1024
-"""Received in one turn at most, four of the longest runs: one or two milliseconds of work, and it fits the cache."""
+"""Most bytes received in one turn, four of the longest runs: one or two milliseconds of work, and it fits the cache."""
 RECEIVE_CALLS = 64
-"""System calls of one turn at most, for the many small datagrams that the kernel does not join."""
+"""Most system calls of one turn, for the many small datagrams that the kernel does not join."""
 
-# Numbers of linux/udp.h that the socket module does not name.
+# Constants of linux/udp.h that the socket module lacks.
 _UDP_SEGMENT = 103
 _UDP_GRO = 104
 _ANCILLARY_BYTES = socket.CMSG_SPACE(4)
 
 _PERHAPS_SEGMENTATION = frozenset({errno.EIO, errno.EINVAL, errno.EMSGSIZE, errno.EOPNOTSUPP, errno.ENOPROTOOPT})
-"""Errors by which a kernel refuses to segment; or the datagram itself is at fault, which only trying it alone tells."""
+"""Errors with which a kernel refuses to segment. The datagram itself may be at fault: only sending it alone shows."""
 
 
 class Run(NamedTuple):
-    """Datagrams of one sender as they lie in memory: `segment` bytes each, the last may be shorter."""
+    """Datagrams of one sender, contiguous in memory: `segment` bytes each, the last may be shorter."""
 
     data: memoryview
     segment: int
@@ -54,7 +55,7 @@ class BatchSocket:
     """Sends and receives runs over a non-blocking UDP socket; used by one thread."""
 
     def __init__(self, sock: socket.socket, stats: LinkStats, on_too_big: Callable[[Address, int], None]) -> None:
-        """`on_too_big` learns of datagrams that are too long for the way out: where to, and their size (bytes)."""
+        """Use `sock`; `on_too_big` gets the destination and size (bytes) of datagrams too long for the way out."""
         self._socket = sock
         self._stats = stats
         self._dropped = stats.dropped
@@ -66,9 +67,9 @@ class BatchSocket:
         self._ancillary: tuple[int, list[tuple[int, int, bytes]]] = (0, [])
 
     def send(self, batch: Batch) -> Batch | None:
-        """Send a batch; returns what has to wait, since the socket's buffer is full.
+        """Send a batch; return what has to wait because the socket's buffer is full.
 
-        Datagrams that the kernel refuses otherwise are counted and dropped: to the sender they are lost like others.
+        Datagrams that the kernel refuses for other reasons are counted and dropped: for the sender they are lost.
         """
         address, data, segment = batch
         destination = to_sockaddr(self._socket.family, address)
@@ -91,7 +92,7 @@ class BatchSocket:
         return None
 
     def receive(self, at_most: int = RECEIVE_CALLS) -> list[Run]:
-        """Return what has arrived, up to so many system calls' worth; the views hold until the next call."""
+        """Return what has arrived, by at most so many system calls; the views are valid until the next call."""
         arena, receive = self._arena, self._socket.recvmsg_into
         runs: list[Run] = []
         start = end = segment = 0
@@ -104,7 +105,7 @@ class BatchSocket:
             except BlockingIOError:
                 break
             except OSError as error:
-                # ICMP errors of earlier sends surface here; the paths' own probes judge.
+                # ICMP errors of earlier sends surface here; the paths' own probes are decisive.
                 self._dropped[f"receive_{_name(error.errno)}"] += 1
                 continue
             if not size:
@@ -126,7 +127,7 @@ class BatchSocket:
         return runs
 
     def _send_each(self, batch: Batch, destination: _SockAddr, refused: OSError | None = None) -> Batch | None:
-        """Send one by one; after `refused`, the first one that leaves proves that segmentation was at fault."""
+        """Send datagrams one by one; after `refused`, the first that leaves proves that segmentation was at fault."""
         address, data, segment = batch
         view = memoryview(data)
         told = False
@@ -140,10 +141,10 @@ class BatchSocket:
             except OSError as error:
                 self._drop(error.errno, 1)
                 if error.errno == errno.EMSGSIZE and not told:
-                    told = True  # all are as long, except for the last
+                    told = True  # all are equally long, except the last
                     self._on_too_big(address, len(piece))
                 continue
-            # A shorter last one proves nothing: it may fit where the others are too long.
+            # A shorter last datagram proves nothing: it may fit where the others are too long.
             if refused is not None and len(piece) == segment:
                 self._stop_segmenting(refused)
                 refused = None
@@ -162,7 +163,7 @@ class BatchSocket:
 
 
 def _has_segmentation(sock: socket.socket) -> bool:
-    """Since Linux 4.18. That a device refuses shows only when something is sent by it."""
+    """Return whether the kernel segments (since Linux 4.18). A device's refusal shows only when it has to send."""
     try:
         sock.getsockopt(socket.IPPROTO_UDP, _UDP_SEGMENT)
     except OSError:
@@ -171,7 +172,7 @@ def _has_segmentation(sock: socket.socket) -> bool:
 
 
 def _turn_on_joining(sock: socket.socket) -> bool:
-    """Since Linux 5.0."""
+    """Let the kernel join datagrams (since Linux 5.0); return whether it does."""
     try:
         sock.setsockopt(socket.IPPROTO_UDP, _UDP_GRO, 1)
     except OSError:

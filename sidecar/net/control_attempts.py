@@ -1,4 +1,4 @@
-"""The connections to the control plane that are being made at once."""
+"""Makes several connections to the control plane at once."""
 
 from __future__ import annotations
 
@@ -14,7 +14,8 @@ if TYPE_CHECKING:
     from sidecar.core.control.ways import ControlWays, Way
 
 STALE_ATTEMPT_S = 1.0
-"""When the network changes, an attempt this old begins again: the kernel repeats its first packet ever more rarely."""
+"""Age at which an attempt starts again when the network changes: the kernel repeats its first packet ever more
+rarely."""
 
 
 class Attempts:
@@ -24,11 +25,11 @@ class Attempts:
         self._tasks: dict[Way, tuple[asyncio.Task[socket.socket], float]] = {}
 
     def start(self, way: Way, now: float) -> None:
-        """Begin to connect."""
+        """Start to connect over a way."""
         self._tasks[way] = asyncio.create_task(_connected(way)), now
 
     def keep(self, now: float, ways: ControlWays) -> list[Way]:
-        """Give up those that have no interface any more or are old; returns the others."""
+        """Give up attempts that are old or whose interface is gone; return the others."""
         for way, (task, began) in list(self._tasks.items()):
             gone = way.interface is not None and not ways.has(way.interface)
             if gone or now > began + STALE_ATTEMPT_S:
@@ -38,7 +39,7 @@ class Attempts:
         return list(self._tasks)
 
     async def wait(self, wake: asyncio.Event, timeout_s: float | None) -> None:
-        """Wait until one ends, something changes, or the time is over."""
+        """Wait until an attempt ends, something changes, or the time is over."""
         waking = asyncio.create_task(wake.wait())
         try:
             tasks = [waking, *(task for task, _ in self._tasks.values())]
@@ -49,7 +50,7 @@ class Attempts:
             waking.cancel()
 
     def take_ended(self) -> list[tuple[Way, socket.socket | OSError]]:
-        """Remove those that have ended, up to the first that connected."""
+        """Remove and return the attempts that have ended, up to the first that connected."""
         ended: list[tuple[Way, socket.socket | OSError]] = []
         for way, (task, _) in list(self._tasks.items()):
             if not task.done():
@@ -62,7 +63,7 @@ class Attempts:
         return ended
 
     def close(self) -> None:
-        """Give up all."""
+        """Give up all attempts."""
         for task, _ in self._tasks.values():
             task.cancel()
             task.add_done_callback(_discard)
@@ -70,7 +71,7 @@ class Attempts:
 
 
 def words(error: OSError) -> str:
-    """The kernel's words; asyncio puts its own, with the address, in their place."""
+    """Return the kernel's words for an error; asyncio replaces them with its own, which include the address."""
     return str(error) if error.errno is None else os.strerror(error.errno)
 
 

@@ -1,11 +1,11 @@
-"""Lets gRPC, which knows nothing of interfaces, reach the control plane over any that lives.
+"""Lets gRPC, which knows nothing about interfaces, reach the control plane over any that lives.
 
     gRPC ──private Unix socket──▶ here ──TCP, bound to an interface──▶ control plane
       ╚═══════════════════════════ TLS, end to end ════════════════════════╝
 
-For every stream there is a line: gRPC's one connection, and the TCP connection behind it, which wins a race over
-interfaces and addresses (`sidecar.core.control.race`) and is watched (`sidecar.core.control.watch`). Bytes are passed
-on as they are. All decisions are the cores'.
+Every stream has a line: gRPC's one connection, and the TCP connection behind it, which wins a race over interfaces and
+addresses (`sidecar.core.control.race`) and is watched (`sidecar.core.control.watch`). Bytes are passed on unchanged.
+The cores make all decisions.
 """
 
 from __future__ import annotations
@@ -37,22 +37,22 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 CHUNK_BYTES = 65_536
-"""Passed on at once; no more of either direction is held here."""
+"""Most bytes passed on at once; no more is held here in either direction."""
 
 MAX_KEPT_ADDRESSES = 4
-"""Addresses remembered because a control plane let us in there, for when its name cannot be looked up."""
+"""Addresses remembered because a control plane registered us there, for when its name cannot be looked up."""
 
 TRY_CHEAPER_S = 2.0
-"""How long a cheaper interface has to connect while the stream goes on over the dearer one."""
+"""Time that a cheaper interface has to connect while the stream goes on over the dearer one."""
 
 PREPARED_S = 5.0
-"""A connection made in advance is used within this time, or not at all."""
+"""Time within which a connection made in advance is used, or not at all."""
 
 ACCEPT_PAUSE_S = 0.1
-"""After the system refused to accept."""
+"""Pause after the system refused to accept."""
 
 ROUTING_TABLE = "none"
-"""In the metrics, the interface of a connection that follows the routing table to an interface that is not ours."""
+"""Metrics label for the interface of a connection that the routing table led over an interface that is not ours."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,7 +62,7 @@ class _Connection:
 
 
 class ControlDialer:
-    """What is known of the ways to the control plane, whatever the stream."""
+    """Keeps what is known about the ways to the control plane across streams."""
 
     def __init__(
         self,
@@ -72,9 +72,10 @@ class ControlDialer:
         remember: Callable[[tuple[Address, ...]], None] = lambda addresses: None,
         check_paths: Callable[[InterfaceName], None] = lambda interface: None,
     ) -> None:
-        """`names` are host:port; `kept` addresses that worked in an earlier run, of which `remember` is told.
+        """Take the control plane's `names` (host:port) and the addresses that worked in an earlier run (`kept`).
 
-        `check_paths` asks the data plane to find out now whether an interface carries anything; `set_paths` follows.
+        `remember` is called with the addresses to keep. `check_paths` asks the data plane to find out now whether an
+        interface carries anything; `set_paths` follows.
         """
         self.names = names
         self.stats = stats
@@ -95,19 +96,19 @@ class ControlDialer:
     # -- from any thread ------------------------------------------------------------------------------------------
 
     def set_interfaces(self, interfaces: Sequence[ControlInterface]) -> None:
-        """These interfaces can carry something now."""
+        """Replace the interfaces that can carry something now."""
 
         def act() -> None:
             new = any(not self.ways.has(interface.name) for interface in interfaces)
             self.ways.set_interfaces(interfaces, time.monotonic())
             if new and self._has_names:
-                self._resolver.look_up(self.names)  # this network's DNS may know what the last one's did not
+                self._resolver.look_up(self.names)  # this network's DNS may know what the last one did not
             self._changed(hopeful=new)
 
         self._post(act)
 
     def set_paths(self, best: Mapping[InterfaceName, PathState]) -> None:
-        """The best state of the data plane's paths over each interface that has some."""
+        """Replace the best state of the data plane's paths over each interface that has some."""
 
         def act() -> None:
             dead = [name for name in best if self.ways.life(name) is not Life.LIVING]
@@ -120,14 +121,14 @@ class ControlDialer:
         if self._loop is None:
             action()
             return
-        # A loop that has just ended takes no calls: then there is nothing left to dial for.
+        # A loop that has just ended takes no calls, but then there is nothing left to dial for.
         with contextlib.suppress(RuntimeError):
             self._loop.call_soon_threadsafe(action)
 
     # -- on the control thread ------------------------------------------------------------------------------------
 
     def start(self, hope: Callable[[], None]) -> None:
-        """Begin, on the running loop; `hope` is called when an attempt may succeed that did not a moment ago."""
+        """Start on the running loop; `hope` is called when an attempt may succeed that could not before."""
         self._loop = asyncio.get_running_loop()
         self._hope = hope
         if self._has_names:
@@ -135,7 +136,7 @@ class ControlDialer:
             self._resolver.start()
 
     def close(self) -> None:
-        """End it."""
+        """Stop looking up names, and drop the prepared connection."""
         self._resolver.stop()
         self._drop_prepared()
 
@@ -153,7 +154,7 @@ class ControlDialer:
             line.close()
 
     def let_in(self, way: Way) -> None:
-        """A control plane registered us at the other end of this way."""
+        """Note that a control plane registered us at the other end of this way."""
         self.ways.proven(way)
         kept = tuple(dict.fromkeys((way.address, *self._kept)))[:MAX_KEPT_ADDRESSES]
         if self._has_names and kept != self._kept:
@@ -182,7 +183,7 @@ class ControlDialer:
             self._prepared = None
 
     def _use(self, addresses: tuple[Address, ...]) -> None:
-        """Names were looked up. What worked before stays: a network may answer for every name with its own portal."""
+        """Use these looked-up addresses. Those that worked stay: a network may answer any name with its own portal."""
         self._found = addresses
         self.ways.set_addresses((*addresses, *self._kept))
         self._changed(hopeful=True)
@@ -194,7 +195,7 @@ class ControlDialer:
             self._hope()
 
     def may_not_bind(self, error: OSError) -> None:
-        """Go where the routing table leads, from now on."""
+        """Follow the routing table from now on."""
         self.ways.can_bind = False
         if not self._told_not_allowed:
             self._told_not_allowed = True
@@ -205,28 +206,28 @@ class ControlDialer:
 
 
 class ControlLine:
-    """gRPC's connection of one stream, and what lies behind it. Made by `ControlDialer.line`."""
+    """gRPC's connection for one stream, and the connection behind it. Made by `ControlDialer.line`."""
 
     def __init__(self, dialer: ControlDialer) -> None:
         self._dialer = dialer
         self._loop = asyncio.get_running_loop()
         self._listening, self.target = listen_privately()
         self.wake = asyncio.Event()
-        """Set when something of the network changed."""
+        """Set when something in the network has changed."""
         self.ended: asyncio.Future[Leave | str] = self._loop.create_future()
-        """The connection is to be left, or why there is none. That it was closed, gRPC learns by itself."""
+        """The decision to leave the connection, or why there is none. gRPC notices by itself when it is closed."""
         self.way: Way | None = None
         """The way it takes, once it is connected."""
         self.broken: str | None = None
-        """What the kernel said when the connection broke."""
+        """The kernel's error when the connection broke."""
         self._race: ControlRace | None = None
 
     def close(self) -> None:
-        """Stop listening, which `serve` does only if it came to run."""
+        """Stop listening, which `serve` does only if it has run."""
         self._listening.close()
 
     def describe(self) -> str | None:
-        """Why there is no connection yet; None if there is one."""
+        """Return why there is no connection yet; None if there is one."""
         if self.way is not None:
             return None
         if self._dialer.ways.empty:
@@ -234,18 +235,18 @@ class ControlLine:
         return "nothing is connected" if self._race is None else self._race.outcome()
 
     def let_in(self) -> None:
-        """A control plane registered us."""
+        """Note that a control plane registered us."""
         if self.way is not None:
             self._dialer.let_in(self.way)
 
     def over(self, *, welcomed: bool, refused: bool) -> None:
-        """The stream has ended; `refused` by the control plane's decision, and not by ours if it was not `welcomed`."""
+        """Note that the stream has ended: `refused` by the control plane, or without ever being `welcomed`."""
         if self.way is not None and not welcomed and not self.ended.done():
             self._dialer.ways.failed(self.way, time.monotonic(), whole_address=refused)
             self._dialer.ways.disappointed(self.way.interface)
 
     async def serve(self) -> None:
-        """Do the work; cancelled when the stream is over."""
+        """Accept gRPC's connection, connect and pass bytes on; cancelled when the stream is over."""
         try:
             with self._listening:
                 inside = await self._accept()
@@ -282,7 +283,7 @@ class ControlLine:
     # -- connecting -----------------------------------------------------------------------------------------------
 
     async def _connect(self) -> _Connection | None:
-        """Race over all ways; None when every one has failed."""
+        """Race over all ways; return None when every one has failed."""
         ways = self._dialer.ways
         attempts = Attempts()
         try:
@@ -297,7 +298,7 @@ class ControlLine:
             attempts.close()
 
     async def _run(self, race: ControlRace, attempts: Attempts, wake: asyncio.Event) -> _Connection | None:
-        """Run a race until somebody wins, everybody has failed, or `wake` is set."""
+        """Run a race until a way wins, every way has failed, or `wake` is set."""
         while not wake.is_set():
             now = time.monotonic()
             for way in race.due(now):
@@ -367,7 +368,7 @@ class ControlLine:
             done()
 
     async def _watch(self, watch: ControlWatch, outside: socket.socket) -> None:
-        """Until the connection is to be left."""
+        """Watch the connection until it has to be left."""
         while True:
             self.wake.clear()
             watch.saw(look(outside), time.monotonic())
@@ -390,7 +391,7 @@ class ControlLine:
         self._end(leave)
 
     async def _moved(self, leave: Leave) -> bool:
-        """Connect over the cheaper interface before the dearer one is left."""
+        """Connect over a cheaper interface before the dearer one is left; return whether that worked."""
         connection = await self._connect_cheaper(leave.to)
         if connection is None:
             for way in leave.to:

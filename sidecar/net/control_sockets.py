@@ -1,4 +1,4 @@
-"""The sockets of the control stream: the private one that gRPC connects to, and TCP bound to an interface."""
+"""Opens the sockets of the control stream: the private one that gRPC connects to, and TCP bound to an interface."""
 
 from __future__ import annotations
 
@@ -15,16 +15,16 @@ if TYPE_CHECKING:
     from sidecar.core.control.ways import Way
 
 USER_TIMEOUT_MS = 5_000
-"""Unacknowledged for so long, TCP gives up (TCP_USER_TIMEOUT), as gRPC has it on its own sockets."""
+"""Time without acknowledgement after which TCP gives up (TCP_USER_TIMEOUT); the same as on gRPC's own sockets."""
 
 NAME_BYTES = 16
-"""Of the private socket's name: nobody guesses it before it is there, and it is new for every stream."""
+"""Length of the private socket's name: nobody can guess it in advance, and it is new for every stream."""
 
 BACKLOG = 8
-"""gRPC's own connection, and room beside those that others make meanwhile."""
+"""Room for gRPC's own connection besides those that others make meanwhile."""
 
 _UCRED = struct.Struct("3i")
-# struct tcp_info of linux/tcp.h: eight bytes, then 32-bit numbers; these are some of them.
+# struct tcp_info of linux/tcp.h: eight bytes, then 32-bit numbers, some of which these are.
 _TCP_INFO_BYTES = 104
 _PROBES = 3
 _UNACKED, _LAST_DATA_RECV_MS, _LAST_ACK_RECV_MS, _RTT_US, _RTTVAR_US = 24, 52, 56, 68, 72
@@ -37,8 +37,8 @@ class NotAllowedError(OSError):
 def listen_privately() -> tuple[socket.socket, str]:
     """Return a listening Unix socket and its name for gRPC.
 
-    In the abstract namespace: nothing of it is left on any disk, however the program ends, and none need be writable.
-    Anybody on this host may connect, as far as they find it: `is_ours` tells who did.
+    The socket is in the abstract namespace: it leaves nothing on disk, however the program ends, and needs no writable
+    one. Anybody on this host who finds it may connect: `is_ours` tells who did.
     """
     name = f"plr-{secrets.token_hex(NAME_BYTES)}"
     listening = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM | socket.SOCK_CLOEXEC)
@@ -53,17 +53,17 @@ def listen_privately() -> tuple[socket.socket, str]:
 
 
 def is_ours(accepted: socket.socket) -> bool:
-    """Whether this very process is at the other end, by the kernel's word."""
+    """Return whether this very process is at the other end, according to the kernel."""
     pid, _, _ = _UCRED.unpack(accepted.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, _UCRED.size))
     return bool(pid == os.getpid())
 
 
 def open_stream(way: Way) -> socket.socket:
-    """Return a TCP socket that takes this way, not connected yet.
+    """Return a TCP socket for this way, not connected yet.
 
     Raises:
         NotAllowedError: it may not be bound to an interface.
-        OSError: the kernel refuses it otherwise.
+        OSError: the kernel refuses it for another reason.
     """
     family = socket.AF_INET6 if ":" in way.address[0] else socket.AF_INET
     sock = socket.socket(family, socket.SOCK_STREAM | socket.SOCK_CLOEXEC)

@@ -1,9 +1,8 @@
-"""The data plane as the rest of the sidecar sees it: the engine behind one lock, a thread for each interface.
+"""Runs the data plane for the rest of the sidecar: the engine behind one lock, a thread for each interface.
 
-Who waits for whom (docs/develop/adr/0004-threads-and-one-lock.md): an interface's thread builds, parses and sends its
-datagrams without any lock; the engine's lock is held only while tables are read and written. There is no coordinator
-thread: whoever has news for the engine (a link's thread, a ROS thread) takes the lock, tells it, and queues what
-comes out.
+Locking (docs/develop/adr/0004-threads-and-one-lock.md): an interface's thread builds, parses and sends its datagrams
+without any lock; the engine's lock is held only while tables are read and written. There is no coordinator thread: a
+thread that has news for the engine (a link's, a ROS thread) takes the lock, tells it, and queues the results.
 """
 
 from __future__ import annotations
@@ -48,34 +47,34 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 EVENTS_A_TURN = 32
-"""A link's events that are taken without letting go of the lock: a path that goes down hands back thousands."""
+"""Events of a link that are taken without releasing the lock: a path that goes down hands back thousands."""
 YIELD_S = 100e-6
-"""Between two turns of one thread, for whoever waits for the lock: the lock goes to who asks first, and a thread that
-must be woken for it is too late."""
+"""Pause between two turns of one thread, for threads that wait for the lock: it goes to the first that asks, and a
+thread that must be woken for it is too late."""
 STOP_S = 2.0
-"""For each of our threads to end."""
+"""Time for each of our threads to end."""
 ERROR_PAUSE_S = 0.1
-"""After an internal error, which may repeat itself at every turn."""
+"""Pause after an internal error, which may recur at every turn."""
 
 
 @dataclass(frozen=True, slots=True)
 class DataPlaneHooks:
-    """Whom the data plane tells."""
+    """Callbacks of the data plane."""
 
     application: Application
     stun: Callable[[InterfaceName, StunEvent], None]
     services_changed: Callable[[], None]
-    """Offers or uses may have changed: the control plane wants to know."""
+    """Offers or uses may have changed, which the control plane has to know."""
     reach_changed: Callable[[], None]
-    """Interfaces or peers may have come: a mapping that was refused for want of them may fit now."""
+    """Interfaces or peers may have come: a mapping that was refused for lack of them may fit now."""
     paths_changed: Callable[[Mapping[InterfaceName, PathState]], None]
-    """The best state of the paths over each interface that has some; called with the engine's lock held."""
+    """Takes the best state of the paths over each interface that has some; called with the engine's lock held."""
     revocations: Callable[[NodeName, bytes], None]
-    """A peer sent revocation lists (PEM), which nobody has judged; called with the engine's lock held."""
+    """Takes a peer's revocation lists (PEM), which nobody has judged; called with the engine's lock held."""
     report_urgent: Callable[[ReportScope], None] = lambda scope: None
-    """Something happened that the next report should tell at once; called with the engine's lock held."""
+    """Something happened that should be reported at once; called with the engine's lock held."""
     pong: Callable[[Pong], None] = lambda _: None
-    """What became of a ping; called on an interface's thread, which must not wait there."""
+    """Takes the result of a ping; called on an interface's thread, which must not wait there."""
 
 
 class ThreadedDataPlane:
@@ -86,7 +85,7 @@ class ThreadedDataPlane:
         self._hooks = hooks
         self._clock = time.monotonic
         self._engine = Engine(config, own, self._clock())
-        self._lock = threading.RLock()  # the application may call us from within its `handle`
+        self._lock = threading.RLock()  # the application may call us from its `handle`
         self._links: dict[InterfaceName, InterfaceThread] = {}
         self._timer = Timer()
         self._decoder = Decoder(self)
@@ -94,7 +93,7 @@ class ThreadedDataPlane:
         self._told_paths = self._engine.routes.best
         self._stopping = False
         self._logged_refusals: dict[NodeName, str] = {}
-        """Their causes."""
+        """Peer -> the cause logged last."""
         self._logged_candidates: dict[NodeName, str] = {}
         self._logged_conflicts: frozenset[tuple[ServiceName, NodeName, str]] = frozenset()
         self._timer_thread = threading.Thread(target=self._run_timer, name="plr-timer", daemon=True)
@@ -102,16 +101,16 @@ class ThreadedDataPlane:
     # -- life -----------------------------------------------------------------------------------------------------
 
     def start(self) -> None:
-        """Start the timer and the decoder; interfaces come by `set_links`."""
+        """Start the timer and the decoder; interfaces come through `set_links`."""
         self._timer_thread.start()
         self._decoder.start()
 
     def set_links(self, links: dict[InterfaceName, InterfaceThread]) -> None:
-        """Use these interfaces from now on; starting and stopping their threads is the caller's."""
+        """Use these interfaces from now on; the caller starts and stops their threads."""
         with self._lock:
             self._links = dict(links)
             self._use_links_that_run(self._clock())
-            self._post_credential()  # it may have been signed anew since they were made
+            self._post_credential()  # it may have been renewed since they were made
             woken = self._queue_outputs()
         self._wake(woken)
         self._hooks.reach_changed()
@@ -128,12 +127,12 @@ class ThreadedDataPlane:
 
     @property
     def busy(self) -> int:
-        """Requests and messages in flight that somebody still waits for."""
+        """Return the number of requests and messages in flight that somebody still waits for."""
         with self._lock:
             return self._engine.busy
 
     def stop(self) -> None:
-        """Say goodbye to the peers, end the timer and the decoder; the caller stops the links after it."""
+        """Say goodbye to the peers, end the timer and the decoder; the caller stops the links afterwards."""
         with self._lock:
             links = list(self._links.values())
         for link in links:
@@ -149,7 +148,7 @@ class ThreadedDataPlane:
 
     @property
     def session(self) -> SessionId:
-        """This run's session."""
+        """Return this run's session."""
         return self._own.credential.session
 
     def submit(self, request_id: RequestId, service: ServiceName, payload: bytes) -> None:
@@ -160,41 +159,41 @@ class ThreadedDataPlane:
         self._wake(woken)
 
     def judge_answer(self, request_id: RequestId, copy: int, problem: str | None) -> None:
-        """Robot: this copy's answer is with the application, or can not be delivered, for this reason."""
+        """Robot: note that this copy's answer was delivered to the application, or cannot be because of `problem`."""
         with self._lock:
             self._engine.judge_answer(request_id, copy, problem, self._clock())
             woken = self._queue_outputs()
         self._wake(woken)
 
     def answered_here(self, request_id: RequestId) -> None:
-        """Robot: the application has its answer, not from the network."""
+        """Robot: note that the application got its answer on the robot."""
         with self._lock:
             self._engine.answered_here(request_id, self._clock())
             woken = self._queue_outputs()
         self._wake(woken)
 
     def complete(self, execution: ExecutionId, payload: bytes, processing_s: float) -> None:
-        """Cloud: the local server answered."""
+        """Cloud: send the local server's answer."""
         with self._lock:
             self._engine.complete(execution, payload, processing_s, self._clock())
             woken = self._queue_outputs()
         self._wake(woken)
 
     def refuse(self, execution: ExecutionId, reason: RejectReason, detail: str) -> None:
-        """Cloud: the request was not or will not be answered."""
+        """Cloud: refuse a request that was not or will not be answered."""
         with self._lock:
             self._engine.refuse(execution, reason, detail, self._clock())
             woken = self._queue_outputs()
         self._wake(woken)
 
     def set_offers(self, offers: tuple[ServiceOffer, ...]) -> None:
-        """Cloud: the services that local servers offer right now."""
+        """Cloud: replace the services that local servers offer right now."""
         with self._lock:
             self._engine.set_offers(offers)
         self._hooks.services_changed()
 
     def set_carried(self, services: Mapping[ServiceName, bool | None]) -> None:
-        """Robot: the proxied services that exist right now, and whether their fallbacks can be asked."""
+        """Robot: replace the proxied services that exist right now, with whether their fallbacks can be asked."""
         with self._lock:
             self._engine.set_carried(services)
         self._hooks.services_changed()
@@ -202,22 +201,22 @@ class ThreadedDataPlane:
     # -- the control client ---------------------------------------------------------------------------------------
 
     def services(self) -> tuple[tuple[ServiceOffer, ...], tuple[ServiceUse, ...]]:
-        """Return what is offered and what is carried right now."""
+        """Return the services that are offered and those that are carried right now."""
         with self._lock:
             return self._engine.offers(), self._engine.uses()
 
     def services_of_peers(self) -> set[ServiceName]:
-        """Return what the peers offer, of whatever name."""
+        """Return the services that the peers offer, whatever their names."""
         with self._lock:
             return self._engine.services_of_peers()
 
     def unreached_services(self) -> dict[ServiceName, int]:
-        """Return the services that peers offer and none of these is reached, and how many peers that are."""
+        """Return the services for which no offering peer is reached, each with the number of those peers."""
         with self._lock:
             return self._engine.unreached_services()
 
     def apply_peers(self, peer_set: PeerSet) -> str | None:
-        """Take a view of the peers; returns why it is refused, or None."""
+        """Take a view of the peers; return why it is refused, or None."""
         self._judge(peer_set.peers)
         with self._lock:
             error = self._engine.apply_peers(peer_set, self._clock())
@@ -229,7 +228,7 @@ class ThreadedDataPlane:
         return error
 
     def _log_peers(self) -> None:
-        """Say what is new of those that are not talked to, or get no requests."""
+        """Log news about peers that are not talked to, or get no requests."""
         with self._lock:
             conflicts = self._engine.offer_conflicts
             refused = list(self._engine.peers.refused.values())
@@ -256,9 +255,9 @@ class ThreadedDataPlane:
         self._logged_conflicts = conflicts
 
     def _judge(self, peers: Iterable[Peer]) -> list[Peer]:
-        """Do the public-key work for these peers before the engine, under its lock, asks what came of it.
+        """Do the public-key work for these peers before the engine, under its lock, asks for the result.
 
-        Returns the good ones.
+        Return the good ones.
         """
         good = []
         for peer in peers:
@@ -269,9 +268,9 @@ class ThreadedDataPlane:
         return good
 
     def trust_changed(self) -> None:
-        """CAs or revocations are others now: peers that are not to be trusted any more lose their sessions at once.
+        """Follow a change of CAs or revocations: peers that are no longer trusted lose their sessions at once.
 
-        Refused ones may be good now.
+        Refused peers may be good now.
         """
         self._own.forget_admitted()
         with self._lock:
@@ -280,20 +279,20 @@ class ThreadedDataPlane:
         self._recheck_peers(self._judge(refused))
 
     def set_revocations(self, numbers: Mapping[int, int], pem: bytes) -> None:
-        """Tell peers of these lists, and have them when they ask; see `RevocationExchange.set_own`."""
+        """Tell peers about these lists, and send them when asked; see `RevocationExchange.set_own`."""
         with self._lock:
             self._engine.revocations.set_own(numbers, pem, self._clock())
             self._timer.arm_at_latest(self._engine.next_timer())
 
     def judged_revocations(self, peer: NodeName, *, good: bool) -> None:
-        """What a peer sent is taken, or is no list of our CAs."""
+        """Note that a peer's lists were accepted, or are no lists of our CAs."""
         with self._lock:
             self._engine.revocations.on_judged(peer, self._clock(), good=good)
 
     def end_expired(self, now_wall: float) -> None:
-        """Part with peers whose certificates have ended by now (seconds since 1970), at next to no cost without any.
+        """Drop peers whose certificates have ended by now (seconds since 1970); nearly free if there are none.
 
-        Say who else is not talked to any more.
+        Log which other peers are not talked to any more.
         """
         if self._own.forget_ended(now_wall):
             with self._lock:
@@ -303,7 +302,7 @@ class ThreadedDataPlane:
         self._log_peers()
 
     def judge_again(self) -> None:
-        """Time has passed, or our clock was set: refused peers may be good now."""
+        """Judge refused peers again: time has passed, or our clock was set, and they may be good now."""
         with self._lock:
             refused = self._engine.peers.all_refused()
         good = self._judge(refused)
@@ -321,17 +320,17 @@ class ThreadedDataPlane:
         self._hooks.reach_changed()
 
     def renew_credential(self, credential: SessionCredential) -> None:
-        """Our certificate was renewed, and this session's credential signed anew.
+        """Use this session's credential, signed with our renewed certificate.
 
         Raises:
-            ValueError: it is of another session.
+            ValueError: it belongs to another session.
         """
         with self._lock:
             self._own.renew(credential)
             self._post_credential()
 
     def apply_mapping(self, mapping: MappingSet) -> str | None:
-        """Take a mapping; returns why it is refused, or None."""
+        """Take a mapping; return why it is refused, or None."""
         with self._lock:
             return self._engine.apply_mapping(mapping)
 
@@ -341,7 +340,7 @@ class ThreadedDataPlane:
             return self._engine.take_report(self._clock(), scope)
 
     def check_paths(self, interface: InterfaceName) -> None:
-        """The control stream is not answered over this interface: find out whether anything else is."""
+        """Find out whether anything is answered over this interface, as the control stream is not."""
         link = self._links.get(interface)
         if link is not None:
             link.post(CheckPaths())
@@ -350,7 +349,7 @@ class ThreadedDataPlane:
     # -- what people ask of one node ------------------------------------------------------------------------------
 
     def ping(self, path: PathId, number: int, size: int) -> None:
-        """Send a ping of `size` bytes over this path; `DataPlaneHooks.pong` is told what became of it, if anything."""
+        """Send a ping of `size` bytes over this path; `DataPlaneHooks.pong` gets the result, if there is one."""
         link = self._links.get(path.interface)
         if link is None:
             self._hooks.pong(Pong(number, path, problem="there is no such interface"))
@@ -359,24 +358,23 @@ class ThreadedDataPlane:
         link.wake()
 
     def paths_to(self, peer: str) -> list[PathId]:
-        """Return the paths to a peer that links have, whatever their state; takes no lock."""
+        """Return the links' paths to a peer, whatever their state; takes no lock."""
         return [path for link in list(self._links.values()) for path in link.link.paths_to(peer)]
 
     def refused_peers(self, at_most: int) -> list[tuple[NodeName, str]]:
-        """Return who is not talked to, and why."""
+        """Return the peers that are not talked to, and why."""
         with self._lock:
             refused = list(islice(self._engine.peers.refused.values(), at_most))
         return [(refusal.peer.name, refusal.why) for refusal in refused]
 
     def path_views(self, now: float) -> Iterator[tuple[PathView, Change | None]]:
-        """Yield how each path is, and its last change; takes no lock, and may be paused between two."""
+        """Yield each path's state and its last change; takes no lock, and may be paused between two."""
         for link in list(self._links.values()):
             for view in link.link.views(now):
                 yield view, link.history.last(view.id)
 
     def gone_paths(self, since: float, at_most: int) -> list[tuple[PathId, Change]]:
-        """Return the paths that are no more, as their peers are none any more, and that lived after `since`; the latest
-        first; takes no lock."""
+        """Return the paths that ended after `since` because their peers are gone, the latest first; takes no lock."""
         gone: list[tuple[PathId, Change]] = []
         for link in list(self._links.values()):
             known = link.link.path_ids()
@@ -388,23 +386,23 @@ class ThreadedDataPlane:
 
     @property
     def engine_stats(self) -> EngineStats:
-        """The requests' counters."""
+        """Return the requests' counters."""
         return self._engine.stats
 
     def link_stats(self) -> list[LinkStats]:
-        """The interfaces' counters."""
+        """Return the interfaces' counters."""
         return [link.link.stats for link in list(self._links.values())]
 
     @property
     def service_mappings(self) -> tuple[ServiceMapping, ...]:
-        """The mapping in force."""
+        """Return the mapping in force."""
         with self._lock:
             return self._engine.service_mappings
 
     # -- LinkOwner ------------------------------------------------------------------------------------------------
 
     def on_link_events(self, events: list[LinkEvent]) -> None:
-        """Take what a link saw."""
+        """Take a link's events."""
         engine = self._engine
         for first in range(0, len(events), EVENTS_A_TURN):
             if first:
@@ -420,36 +418,36 @@ class ThreadedDataPlane:
                 self._decoder.wake()
 
     def on_stun_event(self, interface: InterfaceName, event: StunEvent) -> None:
-        """Take what STUN found."""
+        """Take a STUN event."""
         self._hooks.stun(interface, event)
 
     def on_pong(self, pong: Pong) -> None:
-        """Take what became of a ping."""
+        """Take the result of a ping."""
         self._hooks.pong(pong)
 
     # -- DecodingOwner --------------------------------------------------------------------------------------------
 
     def next_decoding(self) -> Decoding | None:
-        """Return the message of which a slice is to be computed next."""
+        """Return the message whose next slice is to be computed."""
         with self._lock:
             return self._engine.next_decoding()
 
     def on_decoded(self, decoding: Decoding) -> None:
-        """A message is computed."""
+        """Take a message whose decoding is complete."""
         with self._lock:
             self._engine.on_decoded(decoding, self._clock())
             woken = self._queue_outputs()
         self._wake(woken)
 
     def on_decoding_failed(self, decoding: Decoding) -> None:
-        """A message can not be computed."""
+        """Give up a message that cannot be decoded."""
         with self._lock:
             self._engine.on_decoding_failed(decoding)
 
     # -- under the lock -------------------------------------------------------------------------------------------
 
     def _queue_outputs(self) -> set[InterfaceThread]:
-        """Queue commands to links and events to the application, in order; returns the links to wake."""
+        """Queue commands to links and events to the application, in order; return the links to wake."""
         woken: set[InterfaceThread] = set()
         for interface, command in self._engine.take_commands():
             for link in self._links_for(interface):
@@ -466,7 +464,7 @@ class ThreadedDataPlane:
         if best is not self._told_paths:
             self._told_paths = best
             self._hooks.paths_changed(best)
-        # The kernel's timer, not its thread: nearly every request has a deadline, and is answered long before it.
+        # Set the kernel's timer, do not wake its thread: nearly every request is answered long before its deadline.
         self._timer.arm_at_latest(self._engine.next_timer())
         return woken
 
@@ -475,7 +473,7 @@ class ThreadedDataPlane:
         self._engine.set_interfaces(running, now)
 
     def _look_for_hung_links(self, now: float) -> bool:
-        """Return whether the interfaces in use are others now."""
+        """Return whether the interfaces in use have changed."""
         changes = self._watchdog.look(self._links.values(), now)
         if changes is None:
             return False
@@ -484,7 +482,7 @@ class ThreadedDataPlane:
             link.link.stats.hangs += 1
         for link in changes.back:
             log.warning("%s: its driver is back", link.interface)
-            # What it thinks of its paths is as old as what it still has to send.
+            # Its view of its paths is as old as what it still has to send.
             link.post(ResetPaths("driver hung"))
         self._use_links_that_run(now)
         return True
@@ -507,7 +505,7 @@ class ThreadedDataPlane:
             try:
                 self._timer_turn()
             except Exception:
-                # Without this thread no deadline is noticed and no request ends.
+                # Without this thread no deadline would be noticed and no request would end.
                 log.exception("internal error; the timers go on")
                 time.sleep(ERROR_PAUSE_S)
             else:

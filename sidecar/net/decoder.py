@@ -1,7 +1,7 @@
-"""The thread that decodes, so that no interface's own thread does: it would keep all other requests of that interface.
+"""Decodes messages on a thread of its own: an interface's thread would hold up all other requests of that interface.
 
-It takes slices of some milliseconds, from each peer in turn (`core/message/decoding.py`), with nothing locked; the
-codec lets go of the interpreter as well.
+It computes slices of some milliseconds, for each peer in turn (`core/message/decoding.py`), with nothing locked; the
+codec releases the interpreter as well.
 """
 
 from __future__ import annotations
@@ -17,20 +17,20 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 ERROR_PAUSE_S = 0.1
-"""After an internal error, which may repeat itself at every turn."""
+"""Pause after an internal error, which may recur at every turn."""
 
 
 class DecodingOwner(Protocol):
-    """Who has messages to decode; called on the decoder's thread."""
+    """The owner of messages to decode; called on the decoder's thread."""
 
     def next_decoding(self) -> Decoding | None:
-        """Return the message of which a slice is to be computed next."""
+        """Return the message whose next slice is to be computed."""
 
     def on_decoded(self, decoding: Decoding) -> None:
-        """A message is computed."""
+        """Take a message whose decoding is complete."""
 
     def on_decoding_failed(self, decoding: Decoding) -> None:
-        """A message can not be computed, for an internal error."""
+        """Give up a message that cannot be decoded because of an internal error."""
 
 
 class Decoder:
@@ -47,19 +47,19 @@ class Decoder:
         self._thread.start()
 
     def stop(self, timeout_s: float) -> None:
-        """End the thread, after the slice that it computes."""
+        """End the thread after the slice that it is computing."""
         self._stopping = True
         self._wanted.set()
         self._thread.join(timeout_s)
 
     def wake(self) -> None:
-        """There is something to decode; from any thread, nearly free while it is awake."""
+        """Wake the thread to decode; from any thread, nearly free while it is awake."""
         if not self._wanted.is_set():
             self._wanted.set()
 
     def _run(self) -> None:
         while not self._stopping:
-            self._wanted.clear()  # before it looks: what comes from now on wakes it again
+            self._wanted.clear()  # before it looks: later messages wake it again
             decoding = self._owner.next_decoding()
             if decoding is not None:
                 self._guarded_slice(decoding)

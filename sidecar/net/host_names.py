@@ -1,7 +1,6 @@
-"""Turns host names into addresses on a thread of its own, since a dead network's DNS takes minutes.
+"""Resolves host names on a thread of its own, since a dead network's DNS takes minutes.
 
-Names are looked up again now and then: what they name may move. A name that cannot be looked up keeps the addresses
-that it had.
+Names are looked up again periodically, as their hosts may move. A name that cannot be looked up keeps its addresses.
 """
 
 from __future__ import annotations
@@ -24,22 +23,22 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 LOOK_UP_EVERY_S = 60.0
-"""How soon a name that leads somewhere else is noticed."""
+"""Interval of the lookups: a name that leads elsewhere is noticed within this time."""
 RETRY_S = 2.0
-"""While some name has no address."""
+"""The same while some name has no address."""
 NEW_NAMES_PER_S = 0.1
-"""Other sets of names that are used: whoever tells the names aims us at whom they name. After ..."""
+"""Rate at which new sets of names are used, as their sender decides whom we contact; before that ..."""
 NEW_NAMES_AT_ONCE = 4.0
-"""... a start: those of the configuration, of the control plane, of the next one."""
+"""... this many at once: those of the configuration, of the control plane, of the next one."""
 HELD_BACK_S = 1.0
-"""How often it is looked whether others may be used."""
+"""Interval of checks whether new names may be used."""
 
 
 class HostNames:
-    """Looks up host:port names and tells all their addresses whenever these change."""
+    """Looks up host:port names and reports all their addresses whenever these change."""
 
     def __init__(self, what: str, found: Callable[[tuple[Address, ...]], None]) -> None:
-        """`what` the names are of, for the log; `found` is called on the thread of this object."""
+        """Start without names. `what` describes them in the log; `found` is called on this object's thread."""
         self._what = what
         self._found = found
         self._names: tuple[str, ...] = ()
@@ -57,14 +56,14 @@ class HostNames:
         self._thread.start()
 
     def stop(self) -> None:
-        """End the thread; not waited for, since it may be stuck in a lookup."""
+        """End the thread without waiting for it, since it may be stuck in a lookup."""
         self._stopping = True
         self._wake.set()
 
     def look_up(self, names: tuple[str, ...]) -> None:
-        """Use these names from now on; at once, also when they are the same (the network may have changed).
+        """Use these names and look them up at once, even if they are the same: the network may have changed.
 
-        Other names, again and again, wait.
+        New names that come too often wait.
         """
         self._names = names
         self._wake.set()
@@ -83,7 +82,7 @@ class HostNames:
         names = self._used
         self._by_name = {name: self._by_name[name] for name in names if name in self._by_name}
         self._by_name |= {name: (address,) for name in names if (address := numeric_host(name)) is not None}
-        self._tell()  # these need not wait for a name server that does not answer
+        self._tell()  # numeric ones need not wait for a name server that does not answer
         failing: dict[str, OSError] = {}
         for name in names:
             if numeric_host(name) is not None:

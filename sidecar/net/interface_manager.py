@@ -1,6 +1,6 @@
 """Keeps a link for every usable interface: opens sockets, follows hotplug and address changes, runs STUN on each.
 
-The kernel announces changes (`netlink_watch`); at each one, and rarely without, all interfaces are looked at.
+The kernel announces changes (`netlink_watch`). All interfaces are scanned after each one, and rarely without any.
 """
 
 from __future__ import annotations
@@ -39,35 +39,35 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 MAX_INTERFACES = 256
-"""An interface's number is one byte of the datagram's header."""
+"""Most interfaces: an interface's number is one byte of the datagram's header."""
 GRACE_CHECK_S = 0.5
-"""While an interface waits for STUN, how often it is asked whether STUN answers anybody."""
+"""While an interface waits for STUN, interval of checks whether STUN answers any interface."""
 ERROR_PAUSE_S = 0.1
-"""After an error, which may repeat itself at every turn."""
+"""Pause after an error, which may recur at every turn."""
 COALESCE_S = 0.005
-"""Between two readings of a flood of announcements: each costs a turn of the interpreter, which all threads share."""
+"""Pause between two reads of a flood of announcements: each costs a turn of the interpreter that all threads share."""
 
 
 @dataclass(frozen=True, slots=True)
 class InterfaceView:
-    """One interface in use at one moment, for people."""
+    """One interface in use at one moment, for display."""
 
     name: InterfaceName
     suspended: bool
-    """It can carry nothing now."""
+    """Whether it can carry nothing now."""
     addresses: tuple[str, ...]
     families: frozenset[int]
     port: int
     mtu: int
     bound_to: str
     hangs: int
-    """Times that its driver did not return for long."""
+    """Number of times that its driver did not return for long."""
     stun: tuple[StunView, ...]
 
 
 @dataclass(slots=True)
 class _Number:
-    """An interface's number in this run, kept while it is away, with what its next link must know of its last."""
+    """An interface's number in this run, kept while it is away, with what its next link must know about its last."""
 
     id: InterfaceId
     memory: LinkMemory | None = None
@@ -100,7 +100,7 @@ class InterfaceManager:
         self._readiness = Readiness(stun_enabled=config.stun.enabled)
         self._skipped: dict[InterfaceName, str] = {}
         self._idle: frozenset[InterfaceName] = frozenset()
-        """Wanted, and not there or not able to carry anything when looked at last."""
+        """Wanted interfaces that were missing or could carry nothing at the last scan."""
         self._warned = False
         self._socket_refused = False
         self._lock = threading.Lock()
@@ -111,7 +111,7 @@ class InterfaceManager:
         self._thread = threading.Thread(target=self._run, name="plr-interfaces", daemon=True)
 
     def start(self) -> None:
-        """Look once, then keep looking in the background. What is not there yet is used as soon as it comes."""
+        """Scan once, then keep scanning in the background. An interface that is missing is used as soon as it comes."""
         described = [network.interface for network in self._config.networks]
         for line in missing_interfaces(list_interfaces(), self._config.interfaces, described):
             log.warning("%s", line)
@@ -149,7 +149,7 @@ class InterfaceManager:
         return states | {name: not managed.suspended for name, managed in list(self._managed.items())}
 
     def views(self) -> list[InterfaceView]:
-        """Return how the interfaces in use are; from any thread."""
+        """Return the state of the interfaces in use; from any thread."""
         with self._lock:
             managed = [(one, one.interface) for one in self._managed.values()]
         return [
@@ -168,7 +168,7 @@ class InterfaceManager:
         ]
 
     def on_stun_event(self, interface: InterfaceName, event: StunEvent) -> None:
-        """Take what STUN found; called on the interface's thread."""
+        """Take a STUN event; called on the interface's thread."""
         with self._lock:
             managed = self._managed.get(interface)
             if managed is None:
@@ -187,7 +187,7 @@ class InterfaceManager:
         self._publish_candidates()
 
     def _use_stun_servers(self, servers: tuple[Address, ...]) -> None:
-        """The names were looked up; called on the resolver's thread."""
+        """Use these looked-up STUN servers; called on the resolver's thread."""
         with self._lock:
             self._stun_servers = servers
             for managed in self._managed.values():
@@ -222,13 +222,13 @@ class InterfaceManager:
             self._schedule.failed(time.monotonic())
             time.sleep(ERROR_PAUSE_S)
         except Exception:
-            # Interfaces that are not followed any more are as bad as a dead sidecar, and harder to see.
+            # A sidecar that stops following its interfaces is as bad as a dead one, and harder to notice.
             log.exception("internal error; the interfaces are looked at again")
             self._schedule.failed(time.monotonic())
             time.sleep(ERROR_PAUSE_S)
 
     def _suspend_links(self, indices: frozenset[int]) -> None:
-        """Before anything is looked at: what these carried takes other paths now, not after the next look."""
+        """Suspend these links before any scan: their requests take other paths now, not after the next scan."""
         for managed in self._managed.values():
             if managed.interface.index in indices and not managed.suspended:
                 self._suspend(managed, "no carrier")
@@ -254,7 +254,7 @@ class InterfaceManager:
         if added:
             self._data_plane.set_links(self._links())
         if (changed or added) and self._config.stun.enabled:
-            self._resolver.look_up(self._stun_names)  # this network's DNS may know what the last one's did not
+            self._resolver.look_up(self._stun_names)  # this network's DNS may know what the last one did not
         idle = {skipped.name for skipped in choice.skipped if skipped.wanted}
         self._idle = frozenset(idle.union(map(InterfaceName, choice.missing)))
         self._warn_when_none(choice)
@@ -264,7 +264,7 @@ class InterfaceManager:
             self._schedule.failed(time.monotonic())
 
     def _drop_gone(self, choice: InterfaceChoice) -> None:
-        """Suspend what cannot carry now; let go of what is not there any more, or as another device."""
+        """Suspend interfaces that cannot carry now; drop those that are gone or are another device now."""
         usable = {interface.name: interface for interface in choice.usable}
         idle = {skipped.name: skipped for skipped in choice.skipped if skipped.wanted}
         gone: list[ManagedInterface] = []
@@ -340,7 +340,7 @@ class InterfaceManager:
                 self._managed[name].set_ready()
 
     def _warn_when_none(self, choice: InterfaceChoice) -> None:
-        """Without any interface nothing is carried, and nothing else would say so."""
+        """Warn when no interface is in use: nothing is carried then, and nothing else would say so."""
         none = all(managed.suspended for managed in self._managed.values())
         if none and not self._warned:
             reasons = [f"{interface.name}: {interface.reason}" for interface in choice.skipped]
@@ -368,9 +368,9 @@ class InterfaceManager:
         self._candidates_changed(self._candidates, self._down)
 
     def _carry_nothing(self) -> tuple[InterfaceName, ...]:
-        """Those that should: named by the configuration, or in use earlier in this run.
+        """Return the interfaces that carry nothing but should: named in the configuration, or used earlier in this run.
 
-        A port that was never plugged in is nobody's trouble where all interfaces are used, or a glob matches it.
+        A port that was never plugged in is no problem where all interfaces are used, or a glob matches it.
         """
         named = self._config.interfaces or ()
         idle = {name for name in self._idle if name in named or name in self._numbers}

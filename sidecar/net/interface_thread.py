@@ -1,6 +1,6 @@
-"""The driver of one link: a thread that owns one interface's socket, its Link and its StunClient.
+"""Drives one link: a thread owns one interface's socket, its Link and its StunClient.
 
-It only moves bytes, commands and events and arms one timer; every decision is in the cores.
+It only moves bytes, commands and events and arms one timer; the cores make every decision.
 """
 
 from __future__ import annotations
@@ -36,30 +36,30 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 OURS = FIRST_BYTE & 0xF0
-"""First bytes from here on are ours, of whatever version; those below are STUN's."""
+"""First bytes from here on are ours, of any version; lower ones are STUN's."""
 BURSTS_PER_TURN = 4
-"""Bursts of the link that leave before timers and arrivals are looked at again: some milliseconds at most."""
+"""Bursts of the link sent before timers and arrivals are looked at again: some milliseconds at most."""
 SLOW_SEND_S = 0.02
-"""A driver that takes so long for a burst is let go on only after timers had their say: paths may have gone down."""
+"""A driver that takes this long for a burst goes on only after the timers: paths may have gone down."""
 BLOCKED_TIMER_S = 0.005
-"""While the socket takes nothing, timers are looked at this often: what is due may wait for the socket itself."""
+"""Interval of looking at timers while the socket takes nothing: what is due may wait for the socket itself."""
 ERROR_PAUSE_S = 0.1
-"""After an internal error, which may repeat itself at every turn."""
+"""Pause after an internal error, which may recur at every turn."""
 MAX_INBOX = 65_536
-"""Commands that wait for the thread; the engine's outbox is capped far below it."""
+"""Most commands that wait for the thread; the engine's outbox is capped far below."""
 
 
 class LinkOwner(Protocol):
-    """What the thread reports to."""
+    """The receiver of the thread's reports."""
 
     def on_link_events(self, events: list[LinkEvent]) -> None:
-        """Take what the link saw; called on the link's thread."""
+        """Take the link's events; called on the link's thread."""
 
     def on_stun_event(self, interface: InterfaceName, event: StunEvent) -> None:
-        """Take what STUN found; called on the link's thread."""
+        """Take a STUN event; called on the link's thread."""
 
     def on_pong(self, pong: Pong) -> None:
-        """Take what became of a ping; called on the link's thread, which must not wait there."""
+        """Take the result of a ping; called on the link's thread, which must not wait there."""
 
 
 class InterfaceThread:
@@ -84,7 +84,7 @@ class InterfaceThread:
         self._batches = BatchSocket(sock, link.stats, self._on_too_big)
         self._sources = Sources(sock)
         self._unsent: deque[Batch] = deque()
-        """One burst at most: no more is asked for before it has left."""
+        """At most one burst: the link is asked for the next one only when it has left."""
         self._more = False
         self._path_log = PathLog()
         self.history = PathHistory(link.stats.dropped)
@@ -95,12 +95,12 @@ class InterfaceThread:
 
     @property
     def stun(self) -> StunClient | None:
-        """Its STUN client, to be read only; None: STUN is off."""
+        """Return its STUN client, for reading only; None if STUN is off."""
         return self._stun
 
     @property
     def interface(self) -> InterfaceName:
-        """The interface this thread owns."""
+        """Return the interface this thread owns."""
         return self.link.identity.interface
 
     def start(self) -> None:
@@ -129,12 +129,12 @@ class InterfaceThread:
         self._waiter.wake()
 
     def in_turn_for(self, now: float) -> float:
-        """Return for how long (s) the thread has not waited for anything; 0 while it does."""
+        """Return how long (s) the thread's turn has lasted; 0 while it waits."""
         began = self._turn_began
         return 0.0 if began is None else now - began
 
     def is_in_a_call(self) -> bool:
-        """Whether it waits for the kernel: neither for a processor, nor for the interpreter, nor for a lock."""
+        """Return whether it waits for the kernel: not for a processor, the interpreter or a lock."""
         return is_in_a_call(self._thread.native_id)
 
     # Runs on the thread ------------------------------------------------------------------------------------------
@@ -156,7 +156,7 @@ class InterfaceThread:
         try:
             self._turn(readable=readable)
         except Exception:
-            # One interface's bug must not silence the interface for good, nor hide.
+            # A bug must neither silence the interface permanently nor stay hidden.
             log.exception("%s: internal error; the interface goes on", self.interface)
             self.link.stats.dropped["internal_error"] += 1
             time.sleep(ERROR_PAUSE_S)
@@ -164,7 +164,7 @@ class InterfaceThread:
             self._turn_began = None
 
     def _due(self) -> float:
-        """When a turn is wanted without anybody asking for it."""
+        """Return when the next turn is due if nobody wakes the thread."""
         due = self.link.next_timer()
         if self._stun is not None:
             stun_due = self._stun.next_timer()
@@ -175,8 +175,8 @@ class InterfaceThread:
         return 0.0 if self._more else due
 
     def _turn(self, *, readable: bool) -> None:
-        # What somebody waits for goes first, all that can wait comes after: at a low rate every step runs for the first
-        # time in a long while, in cold caches, and costs several times what it does under load.
+        # What somebody waits for goes first, what can wait comes after: at a low rate every step runs in cold caches,
+        # for the first time in a long while, and costs several times what it does under load.
         if readable:
             self._receive(at_most=1)
         self._exchange()
@@ -254,7 +254,7 @@ class InterfaceThread:
             return
         stun.handle_timer(self._clock())
         for data, address in stun.datagrams_to_send():
-            self._batches.send(Batch(address, data, len(data)))  # what finds no room is sent again in time
+            self._batches.send(Batch(address, data, len(data)))  # what finds no room is retransmitted in time
             self.link.stats.datagrams["sent", "stun"] += 1
         while (event := stun.next_event()) is not None:
             self._owner.on_stun_event(self.interface, event)
@@ -274,7 +274,7 @@ class InterfaceThread:
             self._exchange()
 
     def _flush(self) -> bool:
-        """Send what waits; False when it has to go on waiting."""
+        """Send what waits; return False when some of it has to go on waiting."""
         unsent = self._unsent
         began = self._clock()
         while unsent:
@@ -289,7 +289,7 @@ class InterfaceThread:
         return True
 
     def _drop_unsent(self) -> None:
-        """Forget what waits for the paths that went down: they handed it back, and nothing stale shall leave."""
+        """Drop what waits for paths that went down: they handed it back, and nothing stale must leave."""
         unsent, self._unsent = self._unsent, deque()
         for batch in unsent:
             if self.link.in_use(batch.address):

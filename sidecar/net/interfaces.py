@@ -1,7 +1,7 @@
-"""The host's network interfaces as netlink tells them, and which of them carry data.
+"""Lists the host's network interfaces by netlink, and chooses which of them carry data.
 
-Netlink rather than /sys: it answers for the network namespace of the caller, while /sys shows the one it was
-mounted in, and it alone knows the kind of a link.
+Netlink is used rather than /sys: it answers for the network namespace of the caller, while /sys shows the one it
+was mounted in, and it alone knows the kind of a link.
 """
 
 from __future__ import annotations
@@ -32,16 +32,16 @@ _IFA_F_TENTATIVE = 0x40
 _UNUSABLE_ADDRESS = _IFA_F_DADFAILED | _IFA_F_DEPRECATED | _IFA_F_TENTATIVE
 
 LOOPBACK = "loopback"
-"""`Interface.kind` of lo, which netlink gives none."""
+"""`Interface.kind` of lo, for which netlink has none."""
 
 _ORDINARY_KINDS = frozenset({"", "bond", "team", "vlan", "wwan", "rmnet", "ppp"})
-"""Kinds of link that lead out of the machine: hardware (no kind), what bundles or splits it, and modems."""
+"""Kinds of link that lead out of the machine: hardware (no kind), bundles or parts of it, and modems."""
 
 _CONTAINER_AND_TUNNEL_NAMES = (
     "docker*", "br-*", "veth*", "virbr*", "vnet*", "lxc*", "lxdbr*", "podman*", "cni*", "cali*", "flannel*",
     "cilium*", "kube-*", "tun*", "tap*", "wg*", "tailscale*", "zt*", "utun*",
 )  # fmt: skip
-"""Names of the same things, for kernels and drivers that tell no kind."""
+"""Names of containers' interfaces and tunnels, for kernels and drivers that report no kind."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,25 +53,25 @@ class Interface:
     kind: str
     """Netlink's kind (veth, bridge, wireguard, ...), LOOPBACK, or "" for hardware."""
     up: bool
-    """Switched on by the administrator."""
+    """Whether the administrator has switched it on."""
     carrier: bool
-    """The cable is in, the access point or cell is joined."""
+    """Whether the cable is in, or the access point or cell is joined."""
     mtu: int
     addresses: tuple[str, ...] = ()
-    """IPv4 and IPv6 of global or unique-local scope, in canonical form; no link-local ones."""
+    """IPv4 and IPv6 addresses of global or unique-local scope, in canonical form; no link-local ones."""
     gateways: tuple[tuple[int, str], ...] = ()
-    """Where the default routes that leave by it lead, of all tables, sorted: the family that they carry (4, 6), and the
-    next hop, "" for a link that needs none."""
+    """The default routes of all tables over this interface, sorted: the family that they carry (4, 6), and the next
+    hop, "" for a link that needs none."""
 
     @property
     def families(self) -> frozenset[int]:
-        """4, 6, both or none: of its addresses."""
+        """Return the families of its addresses: 4, 6, both or none."""
         return frozenset(6 if ":" in address else 4 for address in self.addresses)
 
     def rebound_since(self, before: Interface) -> Rebind | None:
-        """Return what of the ways out that it had `before` is no more; None when addresses and gateways are the same.
+        """Return what is gone of the ways out it had `before`; None when addresses and gateways are the same.
 
-        A further address alone takes nothing away.
+        An additional address alone takes nothing away.
         """
         rerouted = {family for family, _ in set(self.gateways) ^ set(before.gateways)}
         if not rerouted and set(self.addresses) == set(before.addresses):
@@ -87,12 +87,12 @@ class SkippedInterface:
     index: int
     reason: str
     wanted: bool
-    """It would be used if it could carry anything now."""
+    """Whether it would be used if it could carry anything now."""
 
 
 @dataclass(frozen=True, slots=True)
 class InterfaceChoice:
-    """What `choose` found."""
+    """The result of `choose`."""
 
     usable: tuple[Interface, ...]
     skipped: tuple[SkippedInterface, ...]
@@ -115,8 +115,8 @@ def list_interfaces() -> tuple[Interface, ...]:
 def choose(interfaces: Iterable[Interface], wanted: Sequence[str] | None) -> InterfaceChoice:
     """Pick the interfaces that carry data: all ordinary ones, or those that `wanted` names or matches.
 
-    Loopback, containers, bridges and tunnels are used only under their exact name: neither the default nor a
-    glob brings them in. An interface that is wanted but not up, without carrier or without address is skipped.
+    Loopback, containers, bridges and tunnels are used only by their exact name: neither the default nor a glob
+    includes them. An interface that is wanted but is not up, has no carrier or no address is skipped.
     """
     usable: list[Interface] = []
     skipped: list[SkippedInterface] = []
@@ -136,9 +136,9 @@ def choose(interfaces: Iterable[Interface], wanted: Sequence[str] | None) -> Int
 def missing_interfaces(
     interfaces: Sequence[Interface], wanted: Sequence[str] | None, described: Sequence[str] = ()
 ) -> list[str]:
-    """Return a line for a person about each interface that is not there: a modem comes late, a name is wrong.
+    """Return a readable line about each interface that is missing: a modem comes late, or a name is wrong.
 
-    `wanted` as in `choose`; `described`: names and globs of interfaces of which the configuration says something.
+    `wanted` as in `choose`; `described`: names and globs of interfaces that the configuration describes.
     """
     names = [interface.name for interface in interfaces]
     there = ", ".join(names)
@@ -228,6 +228,6 @@ def _gateways_by_index(messages: Iterable[Any]) -> dict[int, set[tuple[int, str]
 
 
 def _next_hop(route: Any) -> str:
-    """The gateway of a route or of one of its hops; RTA_VIA is one of the other family."""
+    """Return the gateway of a route or of one of its hops; RTA_VIA is a gateway of the other family."""
     via = route.get("gateway") or (route.get("via") or {}).get("addr") or ""
     return str(via)

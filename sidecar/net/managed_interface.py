@@ -1,7 +1,7 @@
-"""One interface in use: its thread, what is known of its addresses, and whether it can carry anything now.
+"""Manages one interface in use: its thread, its known addresses, and whether it can carry anything now.
 
-It stays while the interface does. Without carrier or address it is only suspended: socket, packet numbers and what
-the peers know of it remain good, so that it carries again at once when it is back.
+It lives as long as the interface. Without carrier or address it is only suspended: socket, packet numbers and what
+the peers know about it remain valid, so that it carries again at once when it is back.
 """
 
 from __future__ import annotations
@@ -49,11 +49,11 @@ class ManagedInterface:
         stun_servers: Iterable[Address] | None,
         owner: LinkOwner,
     ) -> None:
-        """Open the socket; raises OSError when it is refused. `stun_servers` is None when STUN is off."""
+        """Open the socket, which may raise OSError. `stun_servers` is None when STUN is off."""
         self.interface = interface
         self.suspended = False
         self.reflexive: dict[int, Address] = {}
-        """By family, where STUN servers see it."""
+        """Family -> the address at which STUN servers see it."""
         opened = open_socket(interface, port)
         self.bound_to = opened.bound_to
         self._bound_address = opened.socket.getsockname()[0] if opened.bound_to is BoundTo.ADDRESS else None
@@ -67,22 +67,22 @@ class ManagedInterface:
 
     @property
     def name(self) -> InterfaceName:
-        """The interface's name."""
+        """Return the interface's name."""
         return self.interface.name
 
     def must_reopen(self, interface: Interface) -> bool:
-        """Whether the socket does not fit the interface as it is now: another device, or its address is gone."""
+        """Return whether the socket no longer fits the interface: it is another device, or its address is gone."""
         if interface.index != self.interface.index:
             return True
         return self._bound_address is not None and self._bound_address not in interface.addresses
 
     def suspend(self, reason: str) -> None:
-        """It can carry nothing, for this reason: its paths are down at once."""
+        """Take its paths down at once, as it can carry nothing for this reason."""
         self.suspended = True
         self._post(SetCarrier(on=False, why_not=reason))
 
     def update(self, interface: Interface) -> bool:
-        """Take the interface as it is now; returns whether anything changed for its peers."""
+        """Take the interface as it is now; return whether anything changed for its peers."""
         before, self.interface = self.interface, interface
         was_suspended, self.suspended = self.suspended, False
         rebind = interface.rebound_since(before)
@@ -94,7 +94,7 @@ class ManagedInterface:
             self._tell_mtu(interface)
         changed = was_suspended or rebind is not None
         if changed:
-            # Told by an older network; what is true now comes within a round trip.
+            # Learned on an older network; the current address comes within a round trip.
             self.reflexive.clear()
             self.thread.post(lambda stun: stun.start(time.monotonic()))
             self.thread.wake()
@@ -107,18 +107,18 @@ class ManagedInterface:
         self._post(SetMtu(interface.mtu))
 
     def set_ready(self) -> None:
-        """It may be used."""
+        """Let it be used."""
         self._post(SetReady(ready=True))
 
     def set_stun_servers(self, servers: tuple[Address, ...]) -> None:
-        """Ask these from now on."""
+        """Ask these servers from now on."""
         self.thread.post(lambda stun: stun.set_servers(servers, time.monotonic()))
         self.thread.wake()
 
     def candidates(self, advertised: Iterable[str]) -> list[Candidate]:
-        """Where peers may reach it; nowhere while it is suspended. `advertised` are further addresses.
+        """Return where peers may reach it, the best first; nowhere while it is suspended.
 
-        The best first: what the operator says, what STUN saw, then its own, the families in turn.
+        The order is: the operator's `advertised` addresses, those that STUN saw, its own with alternating families.
         """
         if self.suspended:
             return []
@@ -132,7 +132,7 @@ class ManagedInterface:
         return [Candidate(number, self.name, kind, address) for address, kind in kinds.items()]
 
     def stop(self) -> LinkMemory:
-        """End the thread; returns what the interface's next link must know."""
+        """End the thread; return what the interface's next link must know."""
         ended = self.thread.stop(STOP_TIMEOUT_S)
         return self.thread.link.remember(hangs=not ended)
 

@@ -1,13 +1,14 @@
-"""Tells that links, addresses or default routes of this network namespace changed, as the kernel announces it.
+"""Reports the kernel's announcements that links, addresses or default routes of this network namespace changed.
 
-What changed exactly is not believed from here: announcements may be lost, so whoever hears of one looks at everything
-(`interfaces.list_interfaces`). One thing cannot wait for that, and is read from the message itself: a link that went.
+What exactly changed is not taken from here: announcements may be lost, so the listener scans everything
+(`interfaces.list_interfaces`). One thing cannot wait for that and is read from the message itself: a link that is gone.
 
     nlmsghdr   0 length u32   4 type u16   6 flags u16   8 sequence u32   12 port u32
     ifinfomsg  16 family u8   18 type u16   20 index i32   24 flags u32            (RTM_NEWLINK, RTM_DELLINK)
     rtmsg      16 family u8   17 destination's length u8                           (RTM_NEWROUTE, RTM_DELROUTE)
 
-A plain socket: of a message only these fields are wanted, and of a flood of messages not even an object each.
+A plain socket is used: only these fields of a message are needed, and a flood of messages must not create an object
+each.
 """
 
 from __future__ import annotations
@@ -32,33 +33,33 @@ _LINK = struct.Struct("=BxHiI")
 _ROUTE = struct.Struct("=BB")
 
 MESSAGE_BYTES = 32_768
-"""The kernel's announcements are at most a page or two."""
+"""Read buffer: the kernel's announcements are at most a page or two."""
 MAX_MESSAGES = 64
-"""Read at one go: a flood must not keep its reader from everything else."""
+"""Most messages read at a time: a flood must not keep its reader from everything else."""
 
 
 class Changes(NamedTuple):
-    """What one look at the announcements told."""
+    """Result of one look at the announcements."""
 
     any: bool
-    """Something that may matter changed, or announcements were lost."""
+    """Whether something that may matter changed, or announcements were lost."""
     gone_links: frozenset[int]
     """Indices of links that cannot carry anything now: switched off, without carrier or removed."""
 
 
 class NetlinkWatch:
-    """Subscribed to the kernel's announcements. One thread waits; any thread may wake it."""
+    """A subscription to the kernel's announcements. One thread waits; any thread may wake it."""
 
     def __init__(self) -> None:
         self.overruns = 0
-        """How often the kernel had more to tell than there was room for."""
+        """Number of times the kernel had more announcements than there was room for."""
         self._wake_fd = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
         self._socket: socket.socket | None = None
         self._poller = select.poll()
         self._poller.register(self._wake_fd, select.POLLIN)
 
     def subscribe(self) -> None:
-        """Hear of every change from now on. Raises OSError where the kernel or a sandbox forbids it."""
+        """Subscribe to every change from now on. Raises OSError where the kernel or a sandbox forbids it."""
         sock = socket.socket(socket.AF_NETLINK, socket.SOCK_RAW | socket.SOCK_CLOEXEC, socket.NETLINK_ROUTE)
         try:
             sock.setblocking(False)
@@ -82,7 +83,7 @@ class NetlinkWatch:
         return Changes(any=False, gone_links=frozenset()) if self._socket is None else self._read(self._socket)
 
     def close(self) -> None:
-        """Close everything; nobody may wait or wake any more."""
+        """Close everything; no thread may wait or wake any more."""
         if self._socket is not None:
             self._socket.close()
         os.close(self._wake_fd)
@@ -107,9 +108,9 @@ class NetlinkWatch:
 
 
 def read_announcements(data: bytes, gone: dict[int, bool]) -> bool:
-    """Return whether the messages in `data` tell of a change that may matter; note links by index in `gone`.
+    """Return whether the messages in `data` report a change that may matter; note links by index in `gone`.
 
-    What cannot be read counts as a change: a look at the interfaces settles it.
+    An unreadable message counts as a change: a scan of the interfaces settles it.
     """
     changed = False
     offset = 0
@@ -134,6 +135,6 @@ def _read_message(kind: int, body: bytes, gone: dict[int, bool]) -> bool:
             gone[index] = kind == RTM_DELLINK or not (flags & _IFF_UP and flags & _IFF_LOWER_UP)
         return True
     if kind in (RTM_NEWROUTE, RTM_DELROUTE):
-        # Of routes only default ones matter here; a router's table of a million others must cost nothing.
+        # Only default routes matter here; a router's table of a million others must cost nothing.
         return len(body) < _ROUTE.size or _ROUTE.unpack_from(body)[1] == 0
     return kind in (RTM_NEWADDR, RTM_DELADDR)

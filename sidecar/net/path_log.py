@@ -1,4 +1,4 @@
-"""Says in the log when a path goes down and when it comes (back) up; the short wobbles between go to debug."""
+"""Logs when a path goes down and when it comes (back) up; short wobbles between go to debug."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ log = logging.getLogger(__name__)
 
 
 class PathLog:
-    """Remembers what was last said of each path of one interface; one thread uses it."""
+    """Remembers what was last logged about each path of one interface; one thread uses it."""
 
     def __init__(self) -> None:
         self._said: dict[PathId, PathState] = {}

@@ -1,4 +1,4 @@
-"""One UDP socket for one interface, and addresses in the two forms that sockets and cores want them."""
+"""Opens one UDP socket for one interface, and converts addresses between the forms of sockets and cores."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 RECEIVE_BUFFER_BYTES = 4 << 20
-"""A quarter of the largest message: what arrives while the interpreter is held has to wait here."""
+"""A quarter of the largest message: what arrives while the interpreter is busy has to wait here."""
 SEND_BUFFER_BYTES = 512 << 10
-"""Some milliseconds of a fast link: more would only go stale there, where nobody can call it back."""
+"""Some milliseconds of a fast link: more would only go stale there, where it cannot be taken back."""
 
 ADDRESS_CACHE_ENTRIES = 4096
-"""More than the addresses of all peers of one sidecar; a flood of forged sources only empties the cache."""
+"""Size of the cache, more than the addresses of all peers of one sidecar; forged sources can only empty it."""
 
-# Numbers of linux/in.h, linux/in6.h and asm/socket.h that the socket module does not name.
+# Constants of linux/in.h, linux/in6.h and asm/socket.h that the socket module lacks.
 _IP_MTU_DISCOVER = 10
 _IPV6_MTU_DISCOVER = 23
 _PMTUDISC_PROBE = 3
@@ -39,10 +39,10 @@ _NO_IPV6 = frozenset({errno.EAFNOSUPPORT, errno.EADDRNOTAVAIL, errno.EPROTONOSUP
 
 
 class BoundTo(enum.StrEnum):
-    """What keeps a socket on its interface."""
+    """The means that keeps a socket on its interface."""
 
     DEVICE = "device"
-    """SO_BINDTODEVICE: it sends and receives by this interface only."""
+    """SO_BINDTODEVICE: the socket sends and receives over this interface only."""
     ADDRESS = "address"
     """The interface's address, one family only: the kernel refused to bind to the device."""
 
@@ -57,9 +57,9 @@ class DataSocket(NamedTuple):
 def open_socket(interface: Interface, port: int) -> DataSocket:
     """Open the non-blocking UDP socket of `interface` on `port`, 0 for any free one.
 
-    IPv4 and IPv6 in one socket where the host has both. Linux before 5.7 lets only CAP_NET_RAW bind to a device,
-    and a sandbox may forbid it to anyone: there the socket is bound to the interface's first address instead,
-    IPv4 preferred. Raises OSError, such as EADDRINUSE for a taken port.
+    One socket serves IPv4 and IPv6 where the host has both. Linux before 5.7 lets only CAP_NET_RAW bind to a
+    device, and a sandbox may forbid it to anyone: there the socket is bound to the interface's first address
+    instead, IPv4 preferred. Raises OSError, such as EADDRINUSE for a taken port.
     """
     try:
         return DataSocket(_open(lambda sock: _bind_to_device(sock, interface, port)), BoundTo.DEVICE)
@@ -79,7 +79,7 @@ def open_socket(interface: Interface, port: int) -> DataSocket:
 
 @functools.lru_cache(ADDRESS_CACHE_ENTRIES)
 def normalise(address: tuple[Any, ...]) -> Address:
-    """Return what recvfrom calls the sender as the cores know it: IPv4-mapped addresses become IPv4."""
+    """Return recvfrom's sender address in the form of the cores: IPv4-mapped addresses become IPv4."""
     host, port = address[0], address[1]
     if host.startswith("::ffff:") and "." in host:
         host = host[len("::ffff:") :]
@@ -88,7 +88,7 @@ def normalise(address: tuple[Any, ...]) -> Address:
 
 @functools.lru_cache(ADDRESS_CACHE_ENTRIES)
 def to_sockaddr(family: int, address: Address) -> tuple[str, int] | tuple[str, int, int, int] | None:
-    """Return `address` as sendto of a socket of `family` wants it, or None when that socket cannot reach it.
+    """Return `address` in the form for sendto on a socket of `family`, or None when that socket cannot reach it.
 
     Raises ValueError for a host that is not an IP address: sendto would look it up and block.
     """
@@ -120,7 +120,7 @@ def _set_options(sock: socket.socket) -> None:
     sock.setblocking(False)
     _set_buffer(sock, _SO_RCVBUFFORCE, socket.SO_RCVBUF, RECEIVE_BUFFER_BYTES)
     _set_buffer(sock, _SO_SNDBUFFORCE, socket.SO_SNDBUF, SEND_BUFFER_BYTES)
-    # Never fragmented (one lost fragment loses the datagram), and no belief in ICMP, which anybody may forge.
+    # No fragmentation (one lost fragment loses the datagram), and no trust in ICMP, which anybody may forge.
     sock.setsockopt(socket.IPPROTO_IP, _IP_MTU_DISCOVER, _PMTUDISC_PROBE)
     if sock.family == socket.AF_INET6:
         sock.setsockopt(socket.IPPROTO_IPV6, socket.IPV6_V6ONLY, 0)
@@ -132,7 +132,7 @@ def _set_buffer(sock: socket.socket, forced: int, polite: int, size: int) -> Non
         sock.setsockopt(socket.SOL_SOCKET, forced, size)
     except PermissionError:
         sock.setsockopt(socket.SOL_SOCKET, polite, size)
-        # The kernel doubles what it grants, for its own bookkeeping.
+        # The kernel doubles the size it grants, for its own bookkeeping.
         granted = sock.getsockopt(socket.SOL_SOCKET, polite) // 2
         if granted < size:
             log.info("socket buffer of %d bytes instead of %d: raise net.core", granted, size)
@@ -145,7 +145,7 @@ def _bind_to_device(sock: socket.socket, interface: Interface, port: int) -> Non
 
 def _bind_to_address(sock: socket.socket, interface: Interface, address: tuple[str, int]) -> None:
     sock.bind(address)
-    # Needs no capability. The address alone does not choose the way out: Linux routes by destination.
+    # This needs no capability. The address alone does not select the way out: Linux routes by destination.
     if sock.family == socket.AF_INET:
         sock.setsockopt(socket.IPPROTO_IP, _IP_UNICAST_IF, socket.htonl(interface.index))
     else:

@@ -1,4 +1,4 @@
-"""Which of our addresses the kernel sends from to where a path leads: asked of a socket that never sends."""
+"""Finds the address of ours that the kernel sends from towards a path's end, by a socket that never sends."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ _UNBOUND = frozenset({"0.0.0.0", "::"})  # noqa: S104 - compared with, not bound
 
 
 class Sources:
-    """Answers for one data socket."""
+    """Finds source addresses for one data socket."""
 
     __slots__ = ("_bound", "_device")
 
@@ -24,7 +24,7 @@ class Sources:
         self._device = sock.getsockopt(socket.SOL_SOCKET, socket.SO_BINDTODEVICE, _DEVICE_NAME_BYTES)
 
     def towards(self, address: Address) -> str | None:
-        """Return the address of ours that datagrams to `address` leave from; None when there is no way there."""
+        """Return our address from which datagrams to `address` leave; None when there is no way there."""
         if self._bound is not None:
             return self._bound
         family = socket.AF_INET6 if ":" in address[0] else socket.AF_INET

@@ -1,4 +1,4 @@
-"""Whether a thread is inside a system call, as the kernel tells it (proc(5), /proc/pid/syscall)."""
+"""Asks the kernel whether a thread is inside a system call (proc(5), /proc/pid/syscall)."""
 
 from __future__ import annotations
 
@@ -11,15 +11,15 @@ _LOCK_CALLS: dict[str, frozenset[str]] = {
     "armv7l": frozenset({"240", "422", "449"}),
     "riscv64": frozenset({"98", "449"}),
 }
-"""futex, futex_time64 and futex_waitv, by which a thread waits for the interpreter or for another lock of ours."""
+"""futex, futex_time64 and futex_waitv, in which a thread waits for the interpreter or for another lock of ours."""
 
 _HERE = _LOCK_CALLS.get(platform.machine())
 
 
 def is_in_a_call(thread_id: int | None) -> bool:
-    """Whether this thread of ours waits in the kernel, but for no lock: neither for a processor nor for another thread.
+    """Return whether this thread of ours waits in the kernel, but for no lock, processor or other thread.
 
-    True as well where that can not be told. `thread_id` is the kernel's (`Thread.native_id`).
+    Return True also where that cannot be found out. `thread_id` is the kernel's (`Thread.native_id`).
     """
     if thread_id is None or _HERE is None:
         return True

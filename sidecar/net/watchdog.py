@@ -1,7 +1,7 @@
 """Notices interface threads that hang in their driver.
 
-A hung thread cannot say that its paths are down: its link does not run. Whoever waits for the engine's timers looks
-instead, and the engine treats the interface as gone until its thread is back.
+A hung thread cannot say that its paths are down: its link does not run. So the thread that waits for the engine's
+timers looks, and the engine treats the interface as gone until its thread is back.
 """
 
 from __future__ import annotations
@@ -14,35 +14,36 @@ if TYPE_CHECKING:
     from sidecar.net.interface_thread import InterfaceThread
 
 HUNG_AFTER_S = 0.25
-"""A turn takes some milliseconds, and a path is silent for 60 ms at least before it is doubted."""
+"""Duration of a turn that counts as hung: a turn takes some milliseconds, and a path is doubted after 60 ms of silence
+at the earliest."""
 LOOK_EVERY_S = 0.1
 
 
 class Changes(NamedTuple):
-    """What changed since the last look."""
+    """Threads that hung or came back since the last look."""
 
     hung: list[InterfaceThread]
     back: list[InterfaceThread]
 
 
 class Watchdog:
-    """Remembers who hangs. Used under the data plane's lock."""
+    """Remembers the hung threads. Used under the data plane's lock."""
 
     def __init__(self, now: float) -> None:
         self._hung: set[InterfaceThread] = set()
         self._looked_at = now
 
     def hangs(self, thread: InterfaceThread) -> bool:
-        """Whether it hung at the last look."""
+        """Return whether it hung at the last look."""
         return thread in self._hung
 
     def look(self, threads: Collection[InterfaceThread], now: float) -> Changes | None:
-        """Look at these threads, all that there are; returns what changed, if anything did."""
+        """Look at these threads, which are all there are; return what changed, if anything did."""
         slept, self._looked_at = now - self._looked_at, now
         if slept > HUNG_AFTER_S:
             return None  # we did not get to run either: the machine stalled, not a driver
         before = self._hung
-        # On a busy machine a thread may not get to run for as long; that is no driver's fault, and ends by itself.
+        # On a busy machine a thread may not run for as long; that is not the driver's fault, and ends by itself.
         self._hung = {
             thread
             for thread in threads
