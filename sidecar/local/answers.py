@@ -1,7 +1,7 @@
-"""What a sidecar's answers consist of, as whoever asks checks them: what does not fit was written by something else.
+"""Checks a sidecar's answers for the client: an answer that does not fit was written by something else.
 
-Keys may be missing in the answer of another version, but for those that say what an entry is about. Keys and parts that
-are not known here are left out.
+Keys may be missing in the answer of another version, except those that identify an entry. Keys and parts that are
+unknown here are left out.
 """
 
 from __future__ import annotations
@@ -20,22 +20,22 @@ Whole = Annotated[int, Field(ge=-(1 << 63), le=(1 << 63) - 1)]
 Address = Annotated[list[Text | Whole], Field(min_length=2, max_length=2)]
 """Host and port."""
 Line = dict[str, Any]
-"""The keys of `_Line` that are there."""
+"""The keys of `_Line` that are present."""
 
 
 class _Entry(BaseModel):
-    """What has a default may be missing, and is then missing here too."""
+    """Base of all entries. A key with a default may be missing, and is then missing here too."""
 
     model_config = ConfigDict(strict=True, allow_inf_nan=False, frozen=True)
 
 
 class _Line(_Entry):
-    """The frame of all of them."""
+    """The frame of every line."""
 
     id: Whole | None = None
     part: Text = ""
     value: Any = None
-    """What that part is made of."""
+    """The content of that part."""
     end: bool = False
     error: Text = ""
     busy: bool = False
@@ -207,7 +207,7 @@ _KINDS: dict[str, Any] = {
 
 
 def decode_line(line: bytes) -> Line | None:
-    """Return what a line says; None: of a part that is not known here. Raises DecodeError."""
+    """Return a line's content; None if its part is unknown here. Raises DecodeError."""
     try:
         said: Line = _checked("", json.loads(line))
         part = said.get("part", "")
@@ -230,5 +230,5 @@ def _checked(part: str, value: Any) -> Any:
 
 @cache
 def _adapter(part: str) -> TypeAdapter[Any]:
-    """What checks the value of a part; of the frame itself, if it is empty."""
+    """Return the checker for the value of a part; for the frame itself if `part` is empty."""
     return TypeAdapter(_KINDS[part] if part else _Line)

@@ -1,7 +1,7 @@
-"""Asks a running sidecar over its local socket, and believes nobody else.
+"""Asks a running sidecar over its local socket, and trusts nobody else.
 
-What listens there may be anybody's, in a folder that others may write: whose it is, is the kernel's to say, and what it
-says is read within bounds and checked.
+In a folder that others may write, any program may listen there: the kernel says whose it is, and its answers are read
+within bounds and checked.
 """
 
 from __future__ import annotations
@@ -28,12 +28,12 @@ if TYPE_CHECKING:
 
 CONNECT_S = 3.0
 STATE_S = 10.0
-"""How long the answer to how everything is may take; thousands of paths come in a second."""
+"""Longest time for the answer about the sidecar's state; thousands of paths come in a second."""
 MAX_LINE_BYTES = 1 << 20
 MAX_STATE_BYTES = 8 << 20
-"""Of the whole answer: some 20,000 paths."""
+"""Longest whole answer: some 20,000 paths."""
 ACCOUNT = "plr"
-"""The unit's user."""
+"""The systemd unit's user."""
 _REPEATED = frozenset({"paths", "interfaces", "mapped"})
 """Parts that come repeatedly."""
 _BUSY = "the sidecar is busy with others: try again"
@@ -49,7 +49,7 @@ class LocalError(Exception):
 
 
 class LocalBusyError(LocalError):
-    """The sidecar runs, and answers others."""
+    """The sidecar runs, and is answering others."""
 
 
 class LocalRefusedError(LocalError):
@@ -59,7 +59,7 @@ class LocalRefusedError(LocalError):
 class LocalClient:
     """A connection to the sidecar whose socket is at `path`; raises LocalError when there is none.
 
-    `owners`: users whose sidecar it may be, beside root, the unit's and this one.
+    `owners`: users whose sidecar it may be, besides root, the unit's user and this one.
     """
 
     def __init__(self, path: Path, owners: frozenset[int] = frozenset()) -> None:
@@ -82,7 +82,7 @@ class LocalClient:
         self._sock.close()
 
     def state(self) -> dict[str, Any]:
-        """Return the parts of how everything is, those that come repeatedly as one list."""
+        """Return the parts of the sidecar's state; a part that comes repeatedly is one list."""
         mine = self._ask({"ask": "state"})
         end = time.monotonic() + STATE_S
         state: dict[str, Any] = {name: [] for name in _REPEATED}
@@ -111,11 +111,11 @@ class LocalClient:
                 state[part].append(value)
 
     def ping(self, peer: str, interface: str | None, size: int) -> int:
-        """Send a ping over each path to a peer; returns the request's id, which `next_line` tells with each answer."""
+        """Send a ping over each path to a peer; return the request's id, which each answer's line repeats."""
         return self._ask({"ask": "ping", "peer": peer, "interface": interface, "size": size})
 
     def next_line(self, timeout_s: float) -> Line | None:
-        """Return the next line; None: none came in time."""
+        """Return the next line; None if none came in time."""
         end = time.monotonic() + timeout_s
         while True:
             line, line_bytes = self._next(end - time.monotonic())
@@ -123,7 +123,7 @@ class LocalClient:
                 return line
 
     def _next(self, timeout_s: float) -> tuple[Line | None, int]:
-        """Return the next line (None: nothing that is known here) and how many bytes it has (0: none came in time)."""
+        """Return the next line (None if unknown here) and its number of bytes (0 if none came in time)."""
         end = time.monotonic() + timeout_s
         searched = 0
         while True:
@@ -157,7 +157,7 @@ class LocalClient:
         except TimeoutError:
             raise LocalBusyError("the sidecar reads nothing: it is stopped, or very busy") from None
         except OSError as error:
-            # What it said before it closed tells more.
+            # Its last words before it closed tell more.
             line = self.next_line(CONNECT_S)
             raise LocalError(str(error.strerror)) if line is None else refusal(line) from error
         return self._id
@@ -194,7 +194,7 @@ def _connect(path: Path) -> socket.socket:
 def _connect_at(path: Path) -> socket.socket:
     sock = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM | socket.SOCK_CLOEXEC)
     try:
-        # With this, and no time limit of Python's own, the kernel waits for a place in a queue that is full.
+        # With this, and without Python's own timeout, the kernel waits for a place in a full queue.
         sock.setsockopt(socket.SOL_SOCKET, socket.SO_SNDTIMEO, _TIMEVAL.pack(int(CONNECT_S), 0))
         sock.connect(str(path))
     except OSError:

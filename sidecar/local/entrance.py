@@ -1,7 +1,7 @@
-"""Listening sockets in the file system: one for root and the sidecar's user, one for the members of a group.
+"""Opens listening sockets in the file system: one for root and the sidecar's user, one for the members of a group.
 
-Two, since the kernel lets everybody who connects wait in one queue before it tells who they are: in a queue of their
-own members cannot keep root out. Whoever holds the lock file beside them has both.
+There are two because the kernel queues everybody who connects before it tells who they are: in a queue of their own,
+members cannot keep root out. The holder of the lock file beside them has both.
 """
 
 from __future__ import annotations
@@ -24,29 +24,30 @@ if TYPE_CHECKING:
 GROUP_SUFFIX = ".group"
 LOCK_SUFFIX = ".lock"
 MAX_SOCKET_BYTES = 107
-"""Of a unix socket's path (unix(7))."""
+"""Longest path of a unix socket (unix(7))."""
 BACKLOG = 64
-"""Who waits in the kernel for being accepted."""
+"""Most connections that wait in the kernel to be accepted."""
 ACCEPTS = Rate(per_s=200.0, at_once=64.0)
-"""Through one entrance. One that is let go at once takes some 50 µs: a flood costs a hundredth of a core."""
+"""Rate through one entrance. A connection that is dropped at once takes some 50 µs: a flood costs a hundredth of a
+core."""
 ACCEPT_PAUSE_S = 0.05
 
 
 def for_group(path: Path) -> Path:
-    """Return where the members of the group knock; `path` is for root and the sidecar's user."""
+    """Return the socket's path for the members of the group; `path` is for root and the sidecar's user."""
     return Path(f"{path}{GROUP_SUFFIX}")
 
 
 class SocketLock:
-    """Keeps a second sidecar from the sockets at `path`, from `take` to `release`; its file stays, so that no other
-    one ever has its name."""
+    """Keeps a second sidecar from the sockets at `path`, from `take` to `release`. Its file stays, so that no other
+    file ever gets its name."""
 
     def __init__(self, path: Path) -> None:
         self._path = Path(f"{path}{LOCK_SUFFIX}")
         self._descriptor: int | None = None
 
     def take(self) -> None:
-        """Raise OSError if another sidecar has it, or its folder is one where others could exchange what is in it."""
+        """Take the lock. Raises OSError if another sidecar has it, or if others could exchange files in its folder."""
         refuse_strange(self._path.parent, self._path.parent.stat())
         flags = os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
         descriptor = os.open(self._path, flags, 0o600)
@@ -63,7 +64,7 @@ class SocketLock:
         self._descriptor = descriptor
 
     def release(self) -> None:
-        """Let another sidecar have it."""
+        """Release the lock to another sidecar."""
         if self._descriptor is not None:
             os.close(self._descriptor)
             self._descriptor = None
@@ -86,13 +87,13 @@ class Entrance:
         self._node: tuple[int, int] | None = None
 
     def open(self, now: float) -> None:
-        """Listen; raises OSError."""
+        """Start to listen; raises OSError."""
         if len(os.fsencode(self.path)) > MAX_SOCKET_BYTES:
             raise OSError(errno.ENAMETOOLONG, f"the path of a socket has at most {MAX_SOCKET_BYTES} bytes")
         _remove_stale(self.path)
         sock = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM | socket.SOCK_NONBLOCK | socket.SOCK_CLOEXEC)
         try:
-            # What the node in the file system will have: nobody else gets in before its group is set.
+            # The file system node gets this mode: nobody else gets in before its group is set.
             os.fchmod(sock.fileno(), stat.S_IRUSR | stat.S_IWUSR)
             sock.bind(str(self.path))
             self._node = _open_to_group(self.path, self.group)
@@ -104,7 +105,7 @@ class Entrance:
         self._accepts = ACCEPTS.bucket(now)
 
     def accept(self, now: float) -> socket.socket | None:
-        """Return a connection, non-blocking; None: none waits, or it is not its time (`again_at`)."""
+        """Return a non-blocking connection; None if none waits, or it is too early (`again_at`)."""
         if self.sock is None or self._accepts is None:
             return None
         if not self._accepts.take(now):
@@ -118,7 +119,7 @@ class Entrance:
         return sock
 
     def close(self) -> None:
-        """Stop listening, and remove the socket, unless another one has its place."""
+        """Stop listening, and remove the socket unless another one has taken its place."""
         if self.sock is None:
             return
         with contextlib.suppress(OSError):
@@ -130,13 +131,13 @@ class Entrance:
 
 
 def _remove_stale(path: Path) -> None:
-    """A socket that nobody listens at was left by a run that was killed."""
+    """Remove a socket that nobody listens at: a killed run left it behind."""
     try:
         if not stat.S_ISSOCK(path.lstat().st_mode):
             raise OSError(errno.EEXIST, "something else than a socket is there")
     except FileNotFoundError:
         return
-    # The lock tells of every sidecar that knows of it; one of another program, or of an earlier version, does not.
+    # The lock only shows sidecars that use it; the socket may be another program's, or an earlier version's.
     with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM | socket.SOCK_NONBLOCK) as probe:
         answer = probe.connect_ex(str(path))
     if answer == errno.ECONNREFUSED:
@@ -146,8 +147,8 @@ def _remove_stale(path: Path) -> None:
 
 
 def _open_to_group(path: Path, group: int | None) -> tuple[int, int]:
-    """Give what was just bound at `path` to the group, which may connect then; returns device and inode."""
-    # By descriptor: under the name there may be a link to any file of ours a moment later.
+    """Let the group connect to the socket just bound at `path`; return its device and inode."""
+    # By descriptor: a moment later the name may be a link to any file of ours.
     descriptor = os.open(path, os.O_PATH | os.O_NOFOLLOW | os.O_CLOEXEC)
     try:
         status = os.fstat(descriptor)

@@ -1,4 +1,4 @@
-"""Who is at the other end of a local socket, by the kernel's word."""
+"""Asks the kernel who is at the other end of a local socket."""
 
 from __future__ import annotations
 
@@ -7,17 +7,17 @@ import struct
 
 _SO_PEERGROUPS = 59
 _MAX_GROUPS_BYTES = 1024
-"""What Python asks the kernel for at most: 256 groups."""
+"""The most that Python can ask the kernel for: 256 groups."""
 _CREDENTIALS = struct.Struct("iII")
 
 
 def user_of(sock: socket.socket) -> int:
-    """Return the user id of the peer: of who connected when it did, or of who listens when that began."""
+    """Return the user id of the peer: the client's when it connected, or the listener's when it began to listen."""
     return _credentials(sock)[1]
 
 
 def groups_of(sock: socket.socket) -> set[int]:
-    """Return the groups of the peer, as they were then."""
+    """Return the groups of the peer at that time."""
     own = _credentials(sock)[2]
     try:
         packed = sock.getsockopt(socket.SOL_SOCKET, _SO_PEERGROUPS, _MAX_GROUPS_BYTES)

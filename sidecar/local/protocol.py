@@ -1,13 +1,13 @@
-"""What is said over a sidecar's local socket: a request is one line of JSON, its answer one or several. Pure. ::
+"""Defines the protocol of a sidecar's local socket: a request is one line of JSON, its answer one or more. Pure. ::
 
-{"id": 1, "ask": "state"}                                        how everything is
+{"id": 1, "ask": "state"}                                        the sidecar's state
 {"id": 2, "ask": "ping", "peer": "cloud-1", "interface": "wlan0", "size": 64}     a ping over each path to a peer
 
-{"id": 1, "part": "paths", "value": ...}      a piece of the answer; those called paths, interfaces come repeatedly
-{"id": 2, "part": "pinged", "value": [...]}   the paths over which it was to leave; then each that is answered:
+{"id": 1, "part": "paths", "value": ...}      a piece of the answer; paths, interfaces and mapped come repeatedly
+{"id": 2, "part": "pinged", "value": [...]}   the paths over which it is sent; then for each that is answered:
 {"id": 2, "part": "pong", "value": {"interface": ..., "remote": ..., "rtt_s": ..., "problem": ...}}
-{"id": 1, "end": true}                        there is no more
-{"id": 1, "error": "...", "busy": true}       the request is refused; busy: later it may not be
+{"id": 1, "end": true}                        the answer is complete
+{"id": 1, "error": "...", "busy": true}       the request is refused; busy: it may succeed later
 """
 
 from __future__ import annotations
@@ -21,18 +21,18 @@ from protos.model.names import node_name
 from sidecar.core.wire.frame import MAX_DATAGRAM_BYTES
 
 VERSION = 1
-"""Told in the part `node`. A part or key that a client does not know is to be ignored."""
+"""Version in the part `node`. A client has to ignore parts and keys that it does not know."""
 MAX_REQUEST_BYTES = 1024
-"""Of one line, its end included."""
+"""Longest line, including its end."""
 MAX_REQUESTS = 8
-"""Of one connection, being answered."""
+"""Most requests of one connection being answered."""
 MAX_ID = 1 << 32
 _MAX_INTERFACE_CHARACTERS = 15
 
 
 @dataclass(frozen=True, slots=True)
 class StateRequest:
-    """Asks how everything is."""
+    """Asks for the sidecar's state."""
 
     id: int
 
@@ -44,13 +44,13 @@ class PingRequest:
     id: int
     peer: str
     interface: str | None
-    """Over this one alone."""
+    """The only interface to use; None: all."""
     size: int
-    """Bytes of UDP payload, more where a probe does not fit."""
+    """Bytes of UDP payload; raised where a probe does not fit."""
 
 
 def decode_request(line: bytes) -> StateRequest | PingRequest:
-    """Parse one line; raises DecodeError."""
+    """Parse one request line; raises DecodeError."""
     if len(line) > MAX_REQUEST_BYTES:
         raise DecodeError(f"a request has at most {MAX_REQUEST_BYTES} bytes")
     try:
@@ -104,7 +104,7 @@ def encode_end(request_id: int) -> bytes:
 
 
 def encode_error(request_id: int | None, text: str, *, busy: bool = False) -> bytes:
-    """Return the line that refuses a request; without id: whatever was asked. `busy`: it may be asked again later."""
+    """Return the line that refuses a request, or without id any request. `busy`: it may be asked again later."""
     value: dict[str, object] = {"id": request_id, "error": text}
     if busy:
         value["busy"] = True

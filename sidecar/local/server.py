@@ -1,10 +1,10 @@
-"""Serves a sidecar's local socket: few clients at once, none for long, whoever comes; the data plane never waits.
+"""Serves a sidecar's local socket: few clients at once, none for long, any of them; the data plane never waits.
 
-One thread, and no lock of anybody's is held while a client is served. What a client may cost is bounded: connections,
-the bytes of a request, what waits to be read by it, requests a second, pings that are out. Each user has a share of
-that, and root (with the sidecar's own user: the owner) one that the members of the group do not touch. An answer is
-built piece by piece, as the client reads it, in turns with those of others and with a pause after each, so that who has
-thousands of paths holds the interpreter from nobody.
+There is one thread, and it holds no lock while it serves a client. A client's cost is bounded: connections, the bytes
+of a request, unread output, requests a second, outstanding pings. Each user has a share of these, and root (with the
+sidecar's own user: the owner) has one that the members of the group do not touch. An answer is built piece by piece, as
+the client reads it, alternating with those of others and with a pause after each piece, so that thousands of paths do
+not keep the interpreter from other threads.
 """
 
 from __future__ import annotations
@@ -47,35 +47,35 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 GROUP = "plr"
-"""Whose members may ask, beside root and the sidecar's own user."""
+"""Group whose members may ask, besides root and the sidecar's own user."""
 MAX_OWN = 8
-"""Connections of root and the sidecar's own user."""
+"""Most connections of root and the sidecar's own user."""
 MAX_MEMBERS = 16
-"""Connections of all others together, ..."""
+"""Most connections of all others together ..."""
 MAX_OF_A_USER = 4
-"""... and of each."""
+"""... and of each of them."""
 IDLE_S = 30.0
-"""A connection that asks nothing for so long is closed, ..."""
+"""A connection that asks nothing for this long is closed; ..."""
 PATIENCE_S = 5.0
-"""... one that has begun a request, or has not read an answer, after this."""
+"""... one that has begun a request, or has not read an answer, after this time."""
 MAX_UNREAD_BYTES = 65_536
-"""What waits to be read by a client; before more is built, it has to read."""
+"""Output that a client may leave unread; beyond that its requests are not read."""
 STATES = Rates(owner=Rate(4.0, 8.0), members=Rate(2.0, 8.0), member=Rate(1.0, 4.0))
 PING_REQUESTS = Rates(owner=Rate(50.0, 100.0), members=Rate(40.0, 80.0), member=Rate(20.0, 40.0))
 PINGS = Rates(owner=Rate(50.0, 100.0), members=Rate(10.0, 30.0), member=Rate(5.0, 15.0))
-"""Over each interface, which sends few (`sidecar/core/link/pinging.py`): members leave half of them to root."""
+"""Pings over each interface, which sends few (`sidecar/core/link/pinging.py`): members leave half of them to root."""
 MAX_INTERFACES = 64
-"""Of which it is remembered how many pings they were asked for."""
+"""Interfaces whose requested pings are remembered."""
 MAX_PINGS_OUT = 256
 MAX_OUT_OF_MEMBERS, MAX_OUT_OF_A_USER = 192, 64
 PONG_WAIT_S = 10.0
-"""A ping is answered within this, or not at all: a round trip of 10 s is the longest that has to work."""
+"""Time within which a ping is answered, or not at all: a round trip of 10 s is the longest that has to work."""
 REST_S = 0.2
-"""Who asks too often is not read from for so long: refusing takes time as well."""
+"""Time for which a client that asks too often is not read from: refusing takes time as well."""
 PAUSE_S = 0.001
-"""After each piece of an answer, for the other threads."""
+"""Pause after each piece of an answer, for the other threads."""
 LOOK_S = 1.0
-"""How often overdue connections are looked for."""
+"""Interval of the search for overdue connections."""
 ERROR_PAUSE_S = 0.1
 STOP_S = 1.0
 
@@ -86,20 +86,20 @@ _TOO_MANY_PINGS = "too many pings of users other than root: wait a second"
 
 
 class LocalSource(Protocol):
-    """What answers are made of; called on the server's thread."""
+    """The source of the answers; called on the server's thread."""
 
     def state(self) -> Iterator[tuple[str, Any]]:
-        """Yield the parts of how everything is, each small."""
+        """Yield the parts of the sidecar's state, each small."""
 
     def paths_to(self, peer: str, interface: str | None) -> list[PathId]:
-        """Return the paths to a peer, over this interface alone if one is named."""
+        """Return the paths to a peer, only those over `interface` if it is given."""
 
     def ping(self, path: PathId, number: int, size: int) -> None:
-        """Send a ping; `LocalServer.on_pong` is told what became of it."""
+        """Send a ping; `LocalServer.on_pong` gets the result."""
 
 
 class LocalSocketError(Exception):
-    """The socket cannot be had; the text says why."""
+    """The socket cannot be opened; the text says why."""
 
 
 @dataclass(slots=True)
@@ -122,15 +122,15 @@ class _Client:
     unread: bytearray = field(default_factory=bytearray)
     answers: deque[Iterator[bytes]] = field(default_factory=deque)
     rounds: dict[int, _PingRound] = field(default_factory=dict)
-    """By the request's id."""
+    """Ping requests under way, by id."""
     events: int = selectors.EVENT_READ
-    """What it is watched for; 0: nothing."""
+    """Selector events it is watched for; 0: none."""
     rests_until: float = 0.0
-    """Nothing is read from it until then; 0: it does not rest."""
+    """Time until which nothing is read from it; 0: it does not rest."""
     ended: bool = False
-    """It says nothing more, and may still read."""
+    """It sends nothing more, but may still read."""
     closing: bool = False
-    """Nothing more is taken from it."""
+    """No more requests are taken from it."""
 
 
 class LocalServer:
@@ -145,18 +145,18 @@ class LocalServer:
         self._entrances: tuple[Entrance, ...] = ()
         self._group: int | None = None
         self._clients: dict[int, _Client] = {}
-        """By file descriptor."""
+        """Clients by file descriptor."""
         self._selector = selectors.DefaultSelector()
         self._pongs: deque[Pong] = deque()
         self._bell = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
         self._next_number = 0
         self._out: dict[int, tuple[_Client, int, PathId]] = {}
-        """Pings that are out, by number: who asked, and in which request."""
+        """Outstanding pings by number: (client, request's id, path)."""
         now = time.monotonic()
         self._states = Shares(STATES, now)
         self._ping_requests = Shares(PING_REQUESTS, now)
         self._pings: dict[str, Shares] = {}
-        """By interface."""
+        """Shares of pings by interface."""
         self._stopping = False
         self._thread = threading.Thread(target=self._run, name="plr-local", daemon=True)
 
@@ -178,7 +178,7 @@ class LocalServer:
         self._stop_listening()
 
     def on_pong(self, pong: Pong) -> None:
-        """What became of a ping; from any thread, which does not wait."""
+        """Take the result of a ping; from any thread, which does not wait."""
         if len(self._pongs) >= 2 * MAX_PINGS_OUT:
             self.refused["pongs_full"] += 1
             return
@@ -258,7 +258,7 @@ class LocalServer:
         sock = entrance.accept(now)
         if sock is None:
             if entrance.again_at is not None and entrance.sock is not None:
-                # They wait in the kernel, which holds few.
+                # New connections wait in the kernel, which holds few.
                 self._selector.unregister(entrance.sock)
             return
         user = user_of(sock)
@@ -278,7 +278,7 @@ class LocalServer:
         others = [client.user for client in self._clients.values()]
         if user is None:
             return ("full", "too many ask at once: try again") if others.count(None) >= MAX_OWN else None
-        # The socket's mode says the same; a folder that was opened wider, or a descriptor passed on, does not undo it.
+        # The socket's mode demands the same; a folder opened wider, or a descriptor passed on, does not undo this.
         if self._group is None or self._group not in groups_of(sock):
             return "not_allowed", f"only root and members of the group {GROUP} may ask"
         if others.count(user) >= MAX_OF_A_USER:
@@ -305,11 +305,11 @@ class LocalServer:
     def _read(self, client: _Client) -> None:
         try:
             data = client.sock.recv(MAX_REQUEST_BYTES)
-        except BlockingIOError:  # the event was of another connection, which had its number before
+        except BlockingIOError:  # the event belonged to an earlier connection with the same number
             return
         if not data and _is_gone(client.sock):
             raise ConnectionResetError
-        # Else it has shut down its side (as `nc -N` does), and may still read what it has asked for.
+        # Otherwise it has shut down its side (as `nc -N` does), and may still read what it has asked for.
         client.ended = not data
         client.received += data
 
@@ -326,7 +326,7 @@ class LocalServer:
         elif client.ended:
             client.closing = True
             if client.received:
-                # The last line needs no end.
+                # The last line needs no newline.
                 line = bytes(client.received)
                 client.received.clear()
                 self._take(client, line)
@@ -435,7 +435,7 @@ class LocalServer:
             del client.unread[:sent]
         if client.unread or not client.answers:
             return
-        # One piece: those of others, and root's, come in between.
+        # Only one piece: those of others, and root's, come in between.
         piece = next(client.answers[0], None)
         if piece is None:
             client.answers.popleft()
@@ -444,12 +444,12 @@ class LocalServer:
             time.sleep(PAUSE_S)
 
     def _follow(self, client: _Client) -> None:
-        """Wait for what the client may do next."""
+        """Watch the client for what it may do next, or drop it when it is done."""
         busy = bool(client.unread or client.answers)
         if client.closing and not busy and not client.rounds:
             self._drop(client)
             return
-        # Who does not read is not read from.
+        # A client that does not read is not read from.
         silent = client.closing or client.ended or client.rests_until
         reading = not silent and len(client.unread) < MAX_UNREAD_BYTES
         events = (selectors.EVENT_READ if reading else 0) | (selectors.EVENT_WRITE if busy else 0)
@@ -500,14 +500,14 @@ class LocalServer:
 
 
 def _is_gone(sock: socket.socket) -> bool:
-    """Whether the other end is closed, and not only its way to us."""
+    """Return whether the other end is closed, and not only its direction to us."""
     poll = select.poll()
     poll.register(sock, 0)
     return bool(poll.poll(0))
 
 
 def _group() -> int | None:
-    """The group whose members may ask; None: there is none, or the sidecar may not give a socket to it."""
+    """Return the group whose members may ask; None if there is none, or the sidecar may not give it a socket."""
     try:
         group = grp.getgrnam(GROUP).gr_gid
     except KeyError:

@@ -1,4 +1,4 @@
-"""How often each user may do something, so that none takes it from the others, and all together nothing from root.
+"""Limits how often each user may do something, so that no user starves the others, and all together not root.
 
 Pure: the callers pass the time.
 """
@@ -10,12 +10,12 @@ from dataclasses import dataclass
 from protos.base.token_bucket import TokenBucket
 
 MAX_USERS = 64
-"""Remembered, those that have used up something; all of them together have few tokens to use up."""
+"""Users remembered, those that have used up something; all of them together have few tokens to use up."""
 
 
 @dataclass(frozen=True, slots=True)
 class Rate:
-    """So many at once, and so many a second after that."""
+    """A rate: `at_once` immediately, and `per_s` a second after that."""
 
     per_s: float
     at_once: float
@@ -27,14 +27,14 @@ class Rate:
 
 @dataclass(frozen=True, slots=True)
 class Rates:
-    """Of one kind of request."""
+    """Rates for one kind of request."""
 
     owner: Rate
-    """Of root and the sidecar's own user, who take nothing from the members."""
+    """Rate of root and the sidecar's own user, who take nothing from the members."""
     members: Rate
-    """Of all other users together."""
+    """Rate of all other users together."""
     member: Rate
-    """Of one of them."""
+    """Rate of one of them."""
 
 
 class Shares:
@@ -47,11 +47,11 @@ class Shares:
         self._by_user: dict[int, TokenBucket] = {}
 
     def take(self, user: int | None, now: float) -> bool:
-        """Take one; False, and nothing is taken from anybody else, if this user has none left."""
+        """Take a token; return False, and take none from anybody else, if this user has none left."""
         if user is None:
             return self._owner.take(now)
         bucket = self._by_user.get(user) or self._new(user, now)
-        # His own first: who asks too often has not used up what is for all.
+        # The user's own first: a user who asks too often must not use up the shared tokens.
         return bucket is not None and bucket.take(now) and self._members.take(now)
 
     def _new(self, user: int, now: float) -> TokenBucket | None:

@@ -1,7 +1,7 @@
-"""How a running sidecar is, in parts for its local socket: what `plr doctor` judges.
+"""Describes the state of a running sidecar, in parts for its local socket, for `plr doctor` to judge.
 
-Built from what the threads leave behind, as metrics are. The engine's lock is held only to copy the few references of
-the mapping, of the services and of the peers that are refused.
+It is built from what the threads leave behind, as metrics are. The engine's lock is held only to copy the few
+references of the mapping, the services and the refused peers.
 """
 
 from __future__ import annotations
@@ -34,23 +34,23 @@ if TYPE_CHECKING:
 PATHS_A_PART = 16
 SERVICES_A_PART = 16
 GONE_S, MAX_GONE = 3600.0, 64
-"""Paths to nodes that are no peers any more are told for so long, so many."""
+"""Time for which paths to nodes that are no longer peers are reported, and most of them."""
 MAX_REFUSED_PEERS = 64
-"""Shown of those that are not talked to."""
+"""Most refused peers shown."""
 ENVIRONMENT = (
     "ROS_DOMAIN_ID", "ROS_AUTOMATIC_DISCOVERY_RANGE", "ROS_LOCALHOST_ONLY", "ROS_STATIC_PEERS", "ROS_DISTRO",
     "RMW_IMPLEMENTATION", "FASTRTPS_DEFAULT_PROFILES_FILE", "FASTDDS_DEFAULT_PROFILES_FILE", "CYCLONEDDS_URI",
     "AMENT_PREFIX_PATH",
 )  # fmt: skip
-"""What is told of the environment: what ROS goes by, and nothing else."""
+"""Environment variables reported: those that ROS uses, and no others."""
 
 
 @dataclass(frozen=True, slots=True)
 class MappingOrigin:
-    """Where the mapping in force comes from."""
+    """The origin of the mapping in force."""
 
     source: str
-    """control plane, or disk."""
+    """The control plane, or disk."""
     at: float
     """When it was put in force (monotonic, s)."""
 
@@ -64,20 +64,20 @@ class LocalState:
     data_plane: ThreadedDataPlane
     interfaces: Callable[[], Iterable[InterfaceView]]
     idle: Callable[[], Mapping[InterfaceName, bool]]
-    """Interfaces that are wanted, and whether each can carry something."""
+    """Return the wanted interfaces, and whether each can carry something."""
     control: Callable[[], ControlView]
     bridge: Callable[[], BridgeStats]
     unmet: Callable[[], Iterable[str]]
     unreached: Callable[[], Mapping[str, int]]
-    """Services of which servers are known and none is reached, and of how many servers."""
+    """Return the services with known servers of which none is reached, each with the number of servers."""
     origin: Callable[[], MappingOrigin | None]
     tls: TlsWatch | None
     clock: ClockFloor
     started_at: float
-    """Monotonic, s."""
+    """When the sidecar started (monotonic, s)."""
 
     def state(self) -> Iterator[tuple[str, Any]]:
-        """Yield the parts; ages are seconds, none is negative."""
+        """Yield the parts of the state; ages are seconds and never negative."""
         now = time.monotonic()
         yield "node", self._node(now)
         yield "clock", {"floor": self.clock.floor}
@@ -255,5 +255,5 @@ def _interface(view: InterfaceView, now: float) -> dict[str, Any]:
 
 
 def _told(value: str) -> str:
-    """A variable's value; not a configuration that stands in it as a whole, which may hold passwords."""
+    """Return a variable's value, but not a whole configuration in it, which may hold passwords."""
     return f"{len(value)} characters of configuration" if "<" in value else value
