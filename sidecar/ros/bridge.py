@@ -1,6 +1,6 @@
-"""The ROS bridge: between the local ROS graph and the data plane.
+"""Bridges the local ROS graph and the data plane.
 
-One thread, `plr-ros`, owns everything of ROS: it waits for requests and answers, takes, serialises and passes them on,
+One thread, `plr-ros`, owns all ROS entities. It waits for requests and answers, takes, serialises and passes them on,
 and it deserialises and sends what the data plane hands over. `handle` only queues an event and wakes that thread.
 """
 
@@ -31,11 +31,11 @@ if TYPE_CHECKING:
     from sidecar.ports import Application, DataPlane
 
 DRAIN_S = 0.005
-"""Of the ROS thread for what the data plane tells, before the servers' answers have their turn again."""
+"""Time the ROS thread spends on the data plane's events before it takes the servers' answers again."""
 STOP_TIMEOUT_S = 5.0
 """Destroying some hundred DDS endpoints takes less than a second."""
 _ERROR_PAUSE_S = 0.1
-"""After a failure of the wait itself, so that a broken rmw does not burn a core."""
+"""Pause after the wait itself failed, so that a broken rmw does not burn a core."""
 
 log = logging.getLogger(__name__)
 
@@ -57,7 +57,7 @@ class RosBridge:
     """The application side of a sidecar: proxies services on a robot, runs requests in the cloud."""
 
     def __init__(self, *, name: str, role: Role, rules: tuple[ServiceRule, ...], domain_id: int | None = None) -> None:
-        """`name` is the sidecar's; `domain_id` None takes ROS_DOMAIN_ID from the environment as every node does."""
+        """Take the sidecar's `name`; with `domain_id` None, ROS_DOMAIN_ID counts, as for every node."""
         self.name = name
         self.role = role
         self.stats = BridgeStats()
@@ -75,7 +75,7 @@ class RosBridge:
         return self._thread is not None and self._thread.is_alive()
 
     def start(self, data_plane: DataPlane) -> None:
-        """Join the ROS domain and begin; raises rclpy's RCLError when rmw cannot start."""
+        """Join the ROS domain and start the ROS thread; raise rclpy's RCLError when rmw cannot start."""
         if self._thread is not None:
             raise RuntimeError("the bridge was started before")
         loop = RosLoop(sidecar_node_name(self.name), self._domain_id)
@@ -90,7 +90,7 @@ class RosBridge:
         self._thread.start()
 
     def stop(self, timeout: float = STOP_TIMEOUT_S) -> bool:
-        """Withdraw everything and leave the domain; True when that was done within `timeout` seconds."""
+        """Withdraw everything and leave the domain; return True if that took at most `timeout` seconds."""
         self._stopping = True
         if self._loop is not None:
             self._loop.wake()
@@ -103,7 +103,7 @@ class RosBridge:
         return True
 
     def handle(self, event: ApplicationEvent) -> None:
-        """Queue an event for the ROS thread; from any thread, never blocks."""
+        """Queue an event for the ROS thread; any thread may call this, and it never blocks."""
         self._events.put(event)
         loop = self._loop
         if loop is not None and not self._stopping:
@@ -138,13 +138,13 @@ class RosBridge:
                 look_at, due = looks.next_due(), side.next_due()
                 until = look_at if due is None else min(look_at, due)
                 ready = loop.wait(0.0 if self._events else until - time.monotonic())
-            # A wait or a look that failed is tried again; requests at the servers and answers stay as they are.
+            # Retry a wait or look that failed; requests at the servers and answers stay as they are.
             except Exception:
                 self._note_error("wait", time.monotonic())
                 time.sleep(_ERROR_PAUSE_S)
                 continue
             now = time.monotonic()
-            for entity in ready:  # before the events, which may destroy one of them
+            for entity in ready:  # before the events, which may destroy some of them
                 try:
                     entity.take(now)
                 except Exception:
@@ -161,12 +161,12 @@ class RosBridge:
             loop.close()
 
     def _drain(self, side: _Side, now: float) -> None:
-        """Hand over what the data plane told, for DRAIN_S at most."""
+        """Hand over the data plane's events, for DRAIN_S at most."""
         ends = now + DRAIN_S
         while (event := self._events.take()) is not None:
             try:
                 side.handle(event, now)
-            # Whatever one event does wrong, the others go on.
+            # A failing event must not stop the others.
             except Exception:
                 self._note_error("event", now)
             now = time.monotonic()
@@ -185,5 +185,5 @@ class RosBridge:
 
 
 def _assert_protocol(bridge: RosBridge) -> Application:
-    """Lets the type checker compare RosBridge with the seam."""
+    """Let the type checker compare RosBridge with the seam."""
     return bridge

@@ -1,4 +1,4 @@
-"""The layout of a generated message class in CDR, from the description of its type that it carries."""
+"""Derives the CDR layout of a generated message class from the type description that it carries."""
 
 from __future__ import annotations
 
@@ -27,17 +27,17 @@ _BYTES = {
     **dict.fromkeys(("int64", "uint64", "double"), 8),
 }
 MAX_DEPTH = 64
-"""Messages within messages."""
+"""Nesting depth of messages within messages."""
 
 
 class _UnknownLayoutError(Exception):
-    """A field whose bytes are not known here."""
+    """A field whose encoding this module does not know."""
 
 
 def layout_of(message_class: Any) -> Layout | None:
-    """Return the layout of a message class, None if it has wide characters or long doubles.
+    """Return the layout of a message class, or None if it has wide characters or long doubles.
 
-    Implementations differ in how they write those.
+    Implementations encode those differently.
     """
     try:
         return _structure(message_class, 0)

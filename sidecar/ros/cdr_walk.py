@@ -1,16 +1,16 @@
-"""Walks over a message in CDR before a type support may read it: are its lengths true, and what memory will it take?
+"""Checks the lengths in a CDR message and the memory it will take, before a type support may read it.
 
-A type support makes room for all elements that a length announces before it reads the first one. A length needs four
-bytes, and an element of 200 bytes at least one on the wire: so 16 MiB of bytes from a peer become 4 GB and 14 s on the
-only ROS thread. Here each length is held against the bytes that are there, by the least and the true size of what it
-counts, and the memory that the C message takes is added up. Nothing is allocated but a view.
+A type support allocates room for all elements that a length announces before it reads the first one. A length takes
+four bytes, and an element of 200 bytes may take as little as one on the wire. So 16 MiB from a peer could become 4 GB
+and 14 s on the only ROS thread. This module compares each length with the bytes that are there, using the minimum and
+the actual size of what it counts, and adds up the memory of the C message. It allocates nothing but a view.
 
-The layout is plain CDR (XCDR1, DDS-XTypes 1.3 section 7.4.3) as the rmw implementations of ROS 2 write it: primitives
-are aligned to their size, counted from behind the encapsulation header of 4 bytes; strings and sequences begin with a
-length of 32 bits, a string's counts its NUL.
+The layout is plain CDR (XCDR1, DDS-XTypes 1.3 section 7.4.3) as the rmw implementations of ROS 2 write it. Primitives
+are aligned to their size, counted from the end of the 4-byte encapsulation header. Strings and sequences begin with a
+32-bit length; that of a string includes its NUL.
 
-An honest large message is one long array, or thousands of elements that look alike: runs of elements with the same
-lengths at the same places are skipped at once. What is left is walked step by step, and `MAX_STEPS` of them must do.
+An honest large message is one long array, or thousands of elements that look alike. So runs of elements with the same
+lengths at the same places are skipped at once. The rest is walked step by step, in at most `MAX_STEPS` steps.
 """
 
 from __future__ import annotations
@@ -25,28 +25,28 @@ if TYPE_CHECKING:
 
 ENCAPSULATION_BYTES = 4
 ALIGNMENT = 8
-"""The largest: sizes of what is fixed depend on where it begins, by this."""
+"""Largest alignment: the size of a fixed layout depends on its start position modulo this."""
 MAX_STEPS = 24_000
-"""Lengths looked at one by one, some 20 ms; 21,000 strings, each of another length."""
+"""Lengths checked one by one: some 20 ms, or 21,000 strings of different lengths."""
 COMPARISON_STEPS = 8
-"""What it takes to find out that no more elements look alike, as so many lengths."""
+"""Cost of finding out that no more elements look alike, in steps."""
 MAX_ALLOCATIONS = 250_000
 """Strings and sequences of one message, some 30 ms of the type support's time."""
 MEMORY_FACTOR = 3
-"""A C message takes at most so many times its bytes ..."""
+"""Allowed size of a C message as a multiple of its bytes on the wire ..."""
 FREE_MEMORY_BYTES = 16 << 20
-"""... or this, whichever is more: small messages may be of many short strings."""
+"""... or this, whichever is more: small messages may consist of many short strings."""
 MALLOC_BYTES = 16
-"""What an allocation takes beside its content, at least, and what it is rounded up to."""
+"""Minimum overhead of an allocation, and the multiple that its size is rounded up to."""
 _FEW, _FIRST_CHUNK = 64, 16
 _TRY_AGAIN_AFTER = 64
-"""Elements walked one by one after some that look alike were not followed by more."""
+"""Elements to walk one by one after a block was not followed by any that look alike."""
 
 _BIG_ENDIAN, _LITTLE_ENDIAN = b"\0\0", b"\0\1"
 
 
 class CdrError(ValueError):
-    """The bytes are not a message of the type, or one that takes too much memory or time; the text says what."""
+    """The bytes are no message of the type, or it takes too much memory or time; the text says which."""
 
 
 class Walk:
@@ -60,15 +60,15 @@ class Walk:
         self.end = len(data)
         self.order = "little" if order == "<" else "big"
         self.memory = 0
-        """Bytes that the C message takes beside its own structure."""
+        """Bytes of the C message so far, its own structure included."""
         self.memory_left = memory_bytes
         self.allocations = 0
         self.steps_left = MAX_STEPS
         self.lengths: list[int] | None = None
-        """Where the lengths stood, while elements are compared."""
+        """Positions of the lengths, while elements are compared."""
 
     def length(self, position: int) -> tuple[int, int]:
-        """Return the length at an aligned position, and where what it counts begins."""
+        """Return the length at `position`, once aligned, and where its content begins."""
         position = -(-position // 4) * 4
         begin = position + 4
         if begin > self.end:
@@ -80,26 +80,26 @@ class Walk:
         return found, begin
 
     def step(self, steps: int) -> None:
-        """Count what takes time."""
+        """Count so many steps; raise CdrError beyond MAX_STEPS."""
         self.steps_left -= steps
         if self.steps_left < 0:
             raise CdrError(f"more than {MAX_STEPS} strings and sequences of different lengths")
 
     def note_lengths(self) -> None:
-        """Note from here on where lengths stand."""
+        """Start to note the positions of lengths."""
         self.lengths = []
 
     def noted_lengths(self) -> list[int] | None:
-        """Return where they stood since `note_lengths`, None if another noted them in between."""
+        """Return the positions noted since `note_lengths`, or None if elements within noted theirs in between."""
         lengths, self.lengths = self.lengths, None
         return lengths
 
     def take(self, size: int) -> None:
-        """An allocation of so many bytes."""
+        """Count an allocation of `size` bytes."""
         self.taken(1, MALLOC_BYTES + -(-size // MALLOC_BYTES) * MALLOC_BYTES)
 
     def taken(self, allocations: int, memory: int) -> None:
-        """So many allocations, of so much memory together."""
+        """Count so many allocations with a total of `memory` bytes."""
         self.allocations += allocations
         if self.allocations > MAX_ALLOCATIONS:
             raise CdrError(f"more than {MAX_ALLOCATIONS} strings and sequences")
@@ -110,10 +110,10 @@ class Walk:
 
 @dataclass(frozen=True, slots=True)
 class Fixed:
-    """What always takes the same bytes from the same alignment on."""
+    """A layout whose size depends only on the alignment of its start."""
 
     sizes: tuple[int, ...]
-    """On the wire, the padding before it included, by where it begins modulo ALIGNMENT."""
+    """Bytes on the wire, leading padding included, by start position modulo ALIGNMENT."""
     struct_bytes: int
     struct_alignment: int
 
@@ -127,9 +127,9 @@ class Fixed:
         return position
 
     def walk_many(self, walk: Walk, position: int, count: int) -> int:
-        """The same for `count` in a row."""
+        """Return where `count` of them in a row end; raises CdrError."""
         sizes, begin = self.sizes, position
-        # Where they begin modulo ALIGNMENT repeats after ALIGNMENT of them at the latest.
+        # The start positions modulo ALIGNMENT repeat after at most ALIGNMENT elements.
         for _ in range(min(count, ALIGNMENT)):
             position += sizes[position % ALIGNMENT]
         if count > ALIGNMENT:
@@ -146,14 +146,14 @@ class Fixed:
 
 
 def primitive(size: int) -> Fixed:
-    """Return the layout of a number of so many bytes."""
+    """Return the layout of a number of `size` bytes."""
     alignment = min(size, ALIGNMENT)
     return Fixed(tuple(-position % alignment + size for position in range(ALIGNMENT)), size, alignment, size)
 
 
 @dataclass(frozen=True, slots=True)
 class String:
-    """Characters of one byte, with their NUL."""
+    """One-byte characters and their NUL."""
 
     bound: int | None = None
     struct_bytes: int = 24
@@ -173,7 +173,7 @@ class String:
 
 @dataclass(frozen=True, slots=True)
 class Structure:
-    """Fields, one after the other."""
+    """Fields in sequence, at least one of which is not fixed."""
 
     fields: tuple[Layout, ...]
     struct_bytes: int
@@ -189,7 +189,7 @@ class Structure:
 
 @dataclass(frozen=True, slots=True)
 class Array:
-    """Always so many elements of one kind, none of which is fixed."""
+    """A constant number of elements of one layout that is not fixed."""
 
     element: Layout
     count: int
@@ -204,7 +204,7 @@ class Array:
 
 @dataclass(frozen=True, slots=True)
 class Elements:
-    """A sequence: as many elements as its length says."""
+    """A sequence, whose length says how many elements follow."""
 
     element: Layout
     bound: int | None = None
@@ -231,7 +231,7 @@ Layout = Fixed | String | Structure | Array | Elements
 
 
 def fixed_structure(fields: Sequence[Layout]) -> Fixed | None:
-    """Return the fields as one, if all of them are fixed."""
+    """Return the fields as one fixed layout, or None unless all of them are fixed."""
     sizes = []
     for begin in range(ALIGNMENT):
         position = begin
@@ -245,7 +245,7 @@ def fixed_structure(fields: Sequence[Layout]) -> Fixed | None:
 
 
 def structure(fields: Sequence[Layout]) -> Layout:
-    """Return the layout of a message with these fields; one without any has a byte all the same."""
+    """Return the layout of a message with these fields; without any it still takes one byte."""
     fields = fields or (primitive(1),)
     fixed = fixed_structure(fields)
     if fixed is not None:
@@ -255,7 +255,7 @@ def structure(fields: Sequence[Layout]) -> Layout:
 
 
 def array(element: Layout, count: int) -> Layout:
-    """Return the layout of always `count` elements."""
+    """Return the layout of an array of `count` elements."""
     struct_bytes = count * element.struct_bytes
     if not isinstance(element, Fixed):
         return Array(element, count, struct_bytes, element.struct_alignment, count * element.least)
@@ -269,7 +269,7 @@ def array(element: Layout, count: int) -> Layout:
 
 
 def _struct(fields: Sequence[Layout]) -> tuple[int, int]:
-    """How many bytes the C structure takes, and its alignment."""
+    """Return the size of the C structure in bytes, and its alignment."""
     size, alignment = 0, 1
     for field in fields:
         size = -(-size // field.struct_alignment) * field.struct_alignment + field.struct_bytes
@@ -278,21 +278,21 @@ def _struct(fields: Sequence[Layout]) -> tuple[int, int]:
 
 
 def _walk_elements(element: Layout, walk: Walk, position: int, count: int) -> int:
-    """Return where `count` elements end that are not fixed; those that look alike are skipped together."""
+    """Return where `count` elements that are not fixed end; skip together those that look alike."""
     left, patience = count, 0
     while left:
         if patience or left < 2 * ALIGNMENT or (walk.lengths is not None and left <= _FEW):
-            # Few within others that are compared are compared with these.
+            # A few elements inside others that are being compared are compared along with them.
             position = element.walk(walk, position)
             left -= 1
             patience = max(0, patience - 1)
             continue
         began, allocations, memory = position, walk.allocations, walk.memory
         walk.note_lengths()
-        # After so many the next begins as the first did, whatever the size of one.
+        # After ALIGNMENT elements the next one has the alignment of the first, whatever the size of one.
         for _ in range(ALIGNMENT):
             position = element.walk(walk, position)
-        # None: among them were many to be compared themselves.
+        # None: they contained long runs of elements that were compared themselves.
         lengths = walk.noted_lengths()
         left -= ALIGNMENT
         size = position - began
@@ -305,12 +305,12 @@ def _walk_elements(element: Layout, walk: Walk, position: int, count: int) -> in
 
 
 def _alike(walk: Walk, began: int, size: int, lengths: list[int], most: int) -> int:
-    """How many blocks after the one at `began` have the same lengths at the same places."""
+    """Return how many blocks after the one at `began` have the same lengths at the same places."""
     most = min(most, (walk.end - began) // size - 1)
     where = (np.array(lengths)[:, None] - began + np.arange(4)).reshape(-1)
     first = walk.bytes[began : began + size][where]
     alike, chunk = 0, _FIRST_CHUNK
-    # What is compared in vain is no more than what was found before: hostile bytes must not make this slow.
+    # A vain comparison covers no more than about what matched before: hostile bytes must not make this slow.
     while alike < most:
         chunk = min(chunk, most - alike)
         start = began + size * (alike + 1)
@@ -327,10 +327,10 @@ def _alike(walk: Walk, began: int, size: int, lengths: list[int], most: int) -> 
 
 
 def check(layout: Layout, payload: bytes | memoryview) -> int:
-    """Return how much memory the C message in `payload` will take, in bytes.
+    """Return the memory that the C message in `payload` will take, in bytes.
 
     Raises:
-        CdrError: the bytes are no such message, or one that takes too much memory or too long to check.
+        CdrError: the bytes are no such message, or it takes too much memory or too long to check.
     """
     if len(payload) < ENCAPSULATION_BYTES:
         raise CdrError("shorter than its header")

@@ -1,8 +1,8 @@
-"""Whether ROS 2 can be used here, in words for whoever runs the node, before rclpy is asked.
+"""Says whether ROS 2 can be used here, in words for the node's operator, before rclpy is loaded.
 
-rclpy ends the whole process where RMW_IMPLEMENTATION names what it was not built with, and Fast DDS where the domain's
-ports are too high; both say so in words of their own, deep inside. So the variables are looked at first, and rclpy is
-tried in another process where it could come to that.
+rclpy ends the whole process if RMW_IMPLEMENTATION names one it was not built with, and Fast DDS does if the domain's
+ports are too high. Both explain it in their own terms, from deep inside. So the variables are checked first, and where
+that could happen, rclpy is tried in another process.
 """
 
 from __future__ import annotations
@@ -20,9 +20,9 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
 MAX_DOMAIN_ID = 232
-"""DDS derives UDP ports from the domain's number; those of higher ones do not exist (DDSI-RTPS 2.5, 9.6.2)."""
+"""DDS derives UDP ports from the domain's number; higher numbers give no valid ports (DDSI-RTPS 2.5, 9.6.2)."""
 DEFAULT_RMW = "rmw_fastrtps_cpp"
-"""ROS Jazzy's; it is there with every rclpy, so that naming it needs no trial at each start."""
+"""Default of ROS Jazzy; it comes with every rclpy, so naming it requires no trial at each start."""
 TRY_TIMEOUT_S = 60.0
 """Loading rclpy takes half a second on an idle machine."""
 
@@ -35,9 +35,9 @@ _LACKS_A_LIBRARY = "cannot open shared object file"
 
 
 def problem(environment: Mapping[str, str] = os.environ, *, thorough: bool = False) -> str | None:
-    """Return one line on what keeps ROS 2 from working here, and what to do; None: nothing was found.
+    """Return one line on what keeps ROS 2 from working here and what to do, or None if nothing was found.
 
-    `thorough`: try rclpy in any case, which takes about a second.
+    `thorough` tries rclpy in any case, which takes about a second.
     """
     domain = environment.get("ROS_DOMAIN_ID", "")
     if domain and not (_NUMBER.fullmatch(domain) and int(domain) <= MAX_DOMAIN_ID):
@@ -76,14 +76,14 @@ def problem(environment: Mapping[str, str] = os.environ, *, thorough: bool = Fal
 
 
 def _without_apt(machine: str) -> str:
-    """Return what to do on a `machine`, as uname names it, that has no ROS from apt yet."""
+    """Return what to do on a `machine` (uname's name for it) that has no ROS from apt yet."""
     if machine == "x86_64":
         return "in the checkout: pip install '.[ros]'"
     return f"install it: no wheel of it is for {machine} (docs/start/install.md, ROS from apt)"
 
 
 def _try(environment: Mapping[str, str]) -> str | None:
-    """Return the one line that tells most of what rclpy says when it does not start."""
+    """Return the most telling line of what rclpy says when it does not start, or None if it starts."""
     argv = [sys.executable, "-c", _TRY]
     try:
         done = subprocess.run(  # noqa: S603  (our own interpreter and text)
@@ -96,6 +96,6 @@ def _try(environment: Mapping[str, str]) -> str | None:
     if done.returncode == 0:
         return None
     lines = [line.strip() for line in done.stderr.splitlines() if line.strip()] or [f"it ends with {done.returncode}"]
-    # Of a traceback the last exception's first line says what is wrong; rcl's own message is the only one.
+    # In a traceback, the first line of the last exception says what is wrong; rcl's own message is a single line.
     said = next((line for line in reversed(lines) if _EXCEPTION.match(line)), lines[-1])
     return "".join(char for char in said if char.isprintable())[:_MAX_SAID_CHARACTERS]

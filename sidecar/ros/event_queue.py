@@ -1,10 +1,10 @@
-"""What the data plane tells the ROS thread, taken in turns: one event of each robot, then the next one of each.
+"""Queues the data plane's events for the ROS thread and gives them out round robin, one event per robot.
 
-So a robot that asks a thousand things at once delays another's request by one event, not by a thousand. A robot's own
-events stay in their order. What belongs to no robot has its turn as if it were one.
+So a robot that sends a thousand requests at once delays another's by one event, not by a thousand. The events of one
+robot stay in order. Events that belong to no robot take turns as if they were one robot's.
 
-There is no cap of its own: a request is here only while the engine counts it as running, where each robot has its share
-of MAX_RUNNING and MAX_RUNNING_BYTES (`executions.py`), and is followed by two events at most.
+The queue has no cap of its own. A request is here only while the engine counts it as running, where each robot has its
+share of MAX_RUNNING and MAX_RUNNING_BYTES (`executions.py`), and at most two events follow it.
 """
 
 from __future__ import annotations
@@ -20,21 +20,21 @@ if TYPE_CHECKING:
 
 
 class EventQueue:
-    """Events by robot. `put` is for any thread, the rest for the one that takes."""
+    """Events by robot. Any thread may call `put`; the rest belongs to the thread that takes."""
 
     __slots__ = ("_arrived", "_of")
 
     def __init__(self) -> None:
         self._arrived: deque[ApplicationEvent] = deque()
-        """Not sorted by robot yet. A deque's ends need no lock."""
+        """Events not yet sorted by robot. The ends of a deque need no lock."""
         self._of: OrderedDict[NodeName | None, deque[ApplicationEvent]] = OrderedDict()
-        """The one whose turn comes next first; only those of which something waits."""
+        """Waiting events by robot, in the order of their turns; only robots with waiting events."""
 
     def __bool__(self) -> bool:
         return bool(self._of or self._arrived)
 
     def put(self, event: ApplicationEvent) -> None:
-        """Let an event wait for its turn."""
+        """Queue an event."""
         self._arrived.append(event)
 
     def take(self) -> ApplicationEvent | None:

@@ -1,4 +1,4 @@
-"""Logging on the hot path: the first of a kind at once, then a count of the rest once per period."""
+"""Limits logging on the hot path: the first line of a kind at once, then a count of the rest once per period."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ if TYPE_CHECKING:
     import logging
 
 LOG_PERIOD_S = 5.0
-"""An operator reads one line of a kind every few seconds; more hides the other kinds."""
+"""An operator can read one line of a kind every few seconds; more would hide the other kinds."""
 MAX_KINDS = 512
-"""Kinds are (what happened, service); beyond this the one quiet for longest is forgotten."""
+"""Kinds are (what happened, service); beyond this many, the kind not logged for longest is forgotten."""
 
 
 @dataclass(slots=True)

@@ -1,16 +1,17 @@
-"""Requests and answers as bytes, through rcl's public C functions.
+"""Takes and sends requests and answers as bytes, through rcl's public C functions.
 
-rclpy hands services' messages over as Python objects only, and makes and reads them field by field: 20 to 50
-microseconds for each pose of a path, with the interpreter lock held. The bridge wants bytes. So it lets rclpy create
-the services and clients, and takes and sends through the C functions that rclpy itself calls, with the C messages that
-each type's own type support makes. What is used of the C structures, the same since ROS 2 Humble:
+rclpy hands over messages of services only as Python objects, and makes and reads them field by field. That takes 20 to
+50 microseconds for each pose of a path, with the interpreter lock held. The bridge needs bytes. So rclpy creates the
+services and clients, but the bridge takes and sends through the C functions that rclpy itself calls, with the C
+messages that each type's own type support makes. These parts of the C structures are used, unchanged since ROS 2
+Humble:
 
     rmw_request_id_t       { uint8_t writer_guid[16]; int64_t sequence_number; }
     rcutils_uint8_array_t  { uint8_t * buffer; size_t length, capacity; rcutils_allocator_t allocator; }
     rmw_qos_profile_t, rmw_subscription_options_t (since Humble): `_Qos` and `_SubscriptionOptions` below
 
-Functions are called with the interpreter lock held where that takes microseconds, and without it where they may block
-or move much memory. All of this belongs to one thread: rcl keeps its error text per thread.
+Functions that take microseconds are called with the interpreter lock held; those that may block or move much memory,
+without it. All of this belongs to one thread: rcl keeps its error text per thread.
 """
 
 from __future__ import annotations
@@ -32,26 +33,26 @@ _SERVICE_TAKE_FAILED = 601
 _ERROR_TEXT_BYTES = 1024
 """RCUTILS_ERROR_MESSAGE_MAX_LENGTH"""
 _KEEP_LAST = _RELIABLE = _TRANSIENT_LOCAL = 1
-"""Of rmw_qos_history_policy_e, rmw_qos_reliability_policy_e and rmw_qos_durability_policy_e."""
+"""Values of rmw_qos_history_policy_e, rmw_qos_reliability_policy_e and rmw_qos_durability_policy_e."""
 MAX_UNKNOWN_BYTES = 1 << 20
-"""Of a message whose layout is not known: a type support may take a hundred times as much to read it."""
+"""Maximum size of a message of unknown layout: to read it, a type support may take a hundred times as much memory."""
 LARGE_MESSAGE_BYTES = 65_536
-"""From here on a copy takes longer than handing the interpreter lock to another thread and back (tens of µs)."""
+"""From this size on, a copy takes longer than passing the interpreter lock to another thread and back (tens of µs)."""
 
 FIRST_BUFFER_BYTES = 4096
-"""Enough for most requests; it doubles as it must."""
+"""Initial size, enough for most requests; the buffer doubles as needed."""
 
 
 class RclError(RosBridgeError):
-    """rcl or rmw could not do what it was asked, for a reason other than the bytes."""
+    """rcl or rmw failed for a reason other than the bytes."""
 
 
 class NewClientError(RclError):
-    """The client that asked is not wholly discovered: its answer can be sent later."""
+    """The client that sent the request is not fully discovered yet; its answer can be sent later."""
 
 
 class RmwRequestId(ctypes.Structure):
-    """Which client asked, and its number there."""
+    """The client that sent a request, and the number it gave the request."""
 
     _fields_ = (("writer_guid", ctypes.c_uint8 * 16), ("sequence_number", ctypes.c_int64))
 
@@ -72,7 +73,7 @@ class _Bytes(ctypes.Structure):
 
 
 class _View(ctypes.Structure):
-    """The same, over the memory of a Python bytes object."""
+    """The same structure over the memory of a Python bytes object."""
 
     _fields_ = (
         ("buffer", ctypes.c_char_p),
@@ -87,7 +88,7 @@ class _ErrorText(ctypes.Structure):
 
 
 class _Time(ctypes.Structure):
-    """Zero: the rmw's default, which is without end."""
+    """A duration; zero means the rmw's default, which is unlimited."""
 
     _fields_ = (("seconds", ctypes.c_uint64), ("nanoseconds", ctypes.c_uint64))
 
@@ -116,10 +117,10 @@ class _SubscriptionOptions(ctypes.Structure):
 
 
 class _Functions:
-    """The C functions, by a loader that holds (PyDLL) or releases (CDLL) the interpreter lock."""
+    """The C functions, through a loader that holds (PyDLL) or releases (CDLL) the interpreter lock."""
 
     def __init__(self, loader: Any) -> None:
-        # The very library that rclpy has loaded, never another; its symbols include those of rmw and rcutils below it.
+        # Exactly the library that rclpy has loaded; its symbols include those of rmw and rcutils below it.
         rcl = loader("librcl.so", mode=os.RTLD_NOW | os.RTLD_NOLOAD)
         pointer, status = ctypes.c_void_p, ctypes.c_int
         request_id = ctypes.POINTER(RmwRequestId)
@@ -198,7 +199,7 @@ class Message:
 
 
 class MessageType:
-    """A generated message class whose type support is loaded, to and from bytes (CDR with its 4-byte header)."""
+    """Converts messages of one generated class, its type support loaded, to and from CDR with its 4-byte header."""
 
     __slots__ = (
         "_buffer",
@@ -231,7 +232,7 @@ class MessageType:
         _holding.bytes_fini(self._buffer)
 
     def functions(self) -> _Functions:
-        """The variant to call with the next message of this type, judged by the last one."""
+        """Return the variant to call for the next message of this type, judged by the size of the last one."""
         return _releasing if self._last_length >= LARGE_MESSAGE_BYTES else _holding
 
     def new(self) -> Message:
@@ -243,8 +244,9 @@ class MessageType:
 
     def serialize(self, message: Message) -> bytes:
         """Return the bytes of `message`."""
-        # Fast CDR does not write padding: what lay in the buffer, an earlier message or other memory of this process,
-        # must not go to a peer in it. So the buffer is clean before, and what made it grow is done again.
+        # Fast CDR does not write padding: old content of the buffer, an earlier message or other memory of this
+        # process, must not reach a peer in it. So the buffer is zeroed first, and a message that made it grow is
+        # serialised again.
         buffer = self._buffer
         ctypes.memset(buffer.buffer, 0, buffer.length)
         self._fill_buffer(message)
@@ -267,8 +269,8 @@ class MessageType:
     def deserialize(self, payload: bytes | memoryview) -> Message:
         """Return the message in `payload`, or raise RosBridgeError.
 
-        Hostile bytes neither crash the type support nor make it allocate more than a small multiple of their size: what
-        it would make of them is known before (tests/ros/hostile_bytes.py).
+        Hostile bytes neither crash the type support nor make it allocate more than a small multiple of their size: they
+        are checked before it reads them (tests/ros/hostile_bytes.py).
         """
         self._check(payload)
         message = self.new()
@@ -292,7 +294,7 @@ class MessageType:
 
 
 def take_request(service: int, request_type: MessageType) -> tuple[RmwRequestId, bytes] | None:
-    """Take the next request from the rcl service at this address, if there is one."""
+    """Take the next request from the rcl service at this address, or return None."""
     request_id = RmwRequestId()
     message = request_type.new()
     status = request_type.functions().take_request(service, request_id, message.pointer)
@@ -304,7 +306,7 @@ def take_request(service: int, request_type: MessageType) -> tuple[RmwRequestId,
 
 
 def take_response(client: int, response_type: MessageType) -> tuple[int, bytes] | None:
-    """Take the next response to the rcl client at this address: (number of its request, bytes)."""
+    """Take the next response to the rcl client at this address: (number of its request, bytes), or None."""
     request_id = RmwRequestId()
     message = response_type.new()
     status = response_type.functions().take_response(client, request_id, message.pointer)
@@ -319,8 +321,8 @@ def send_response(service: int, request_id: RmwRequestId, response: Message) -> 
     """Answer a request; rmw may wait up to 0.1 s for a client it has only just discovered.
 
     Raises:
-        NewClientError: that was not enough.
-        RclError: it can not be sent.
+        NewClientError: that time was not enough.
+        RclError: the response cannot be sent.
     """
     status = _releasing.send_response(service, request_id, response.pointer)
     if status == _TIMEOUT:
@@ -339,7 +341,7 @@ def send_request(client: int, request: Message) -> int:
 
 
 def graph_guard(node: int) -> int:
-    """Return the address of the guard condition that rcl triggers when the graph of the rcl node has changed."""
+    """Return the address of the guard condition that rcl triggers when the ROS graph of the rcl node changes."""
     guard = _holding.graph_guard(node)
     if not guard:
         raise RclError(f"no guard condition of the graph: {_take_error()}")
@@ -354,9 +356,9 @@ def wait_for_guard(wait_set: int, guard: int) -> None:
 
 
 class LatchedTopic:
-    """A reader of what each publisher of a topic said last, also before this reader was there.
+    """A reader of each publisher's last messages on a topic, including those sent before this reader existed.
 
-    The topic's name is DDS's own: those of rmw itself can not be had through rcl.
+    The topic's name is the plain DDS name: rcl gives no access to the topics of rmw itself.
     """
 
     def __init__(self, node: int, name: str, message_type: MessageType, depth: int) -> None:
@@ -377,7 +379,7 @@ class LatchedTopic:
             raise RclError(f"cannot read {name}: {_take_error()}")
 
     def take(self) -> bytes | None:
-        """Take the next message, if there is one."""
+        """Take the next message, or return None."""
         message, taken = self._type.new(), ctypes.c_bool()
         status = _holding.take(self._pointer, message.pointer, taken, None)
         if status != _OK:

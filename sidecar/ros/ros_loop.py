@@ -1,7 +1,7 @@
-"""The sidecar's ROS node and a small loop that waits on its entities: one thread owns everything of ROS.
+"""Holds the sidecar's ROS node and a small loop that waits on its entities; one thread owns all of it.
 
-rclpy's own executors are not used: the standard ones build their lists anew in Python for each event, and the
-experimental EventsExecutor starves the other threads of the process (docs/develop/adr/0007-one-thread-owns-ros.md).
+rclpy's own executors are not used: the standard ones rebuild their lists in Python for each event, and the experimental
+EventsExecutor starves the other threads of the process (docs/develop/adr/0007-one-thread-owns-ros.md).
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ _NANOSECONDS = 1_000_000_000
 
 
 def service_qos(depth: int) -> Any:
-    """Return the profile of the bridge's own services and clients: the default one, but for the depth of its queues."""
+    """Return the QoS profile of the bridge's services and clients: the default except for the depth of the queues."""
     return QoSProfile(
         history=qos_profile_services_default.history,
         depth=depth,
@@ -52,8 +52,8 @@ class RosLoop:
 
     def __init__(self, node_name: str, domain_id: int | None) -> None:
         self._context = Context()
-        # Its own context, without rclpy's signal handlers and without the command line: both are the program's.
-        # No log file of ROS's own either: it would need a writable home.
+        # A separate context without rclpy's signal handlers and the command line: both belong to the program.
+        # No ROS log file either: it would need a writable home directory.
         rclpy.init(
             args=["--ros-args", "--disable-external-lib-logs"],
             context=self._context,
@@ -72,7 +72,7 @@ class RosLoop:
         self._guard = _rclpy.GuardCondition(self._context.handle)
         self._graph_guard = graph_guard(self.node.handle.pointer)
         self.graph_changed = False
-        """Whether the graph changed; whoever looks at it says so by setting it back."""
+        """Whether the graph changed; the reader resets it."""
         self._services: dict[Any, Waited] = {}
         self._clients: dict[Any, Waited] = {}
         self._by_pointer: dict[int, Waited] = {}
@@ -95,10 +95,10 @@ class RosLoop:
         self._wait_set = None
 
     def wake(self) -> None:
-        """End the wait. From any thread."""
+        """End the wait; any thread may call this."""
         if not self._woken:
             self._woken = True
-            with contextlib.suppress(_rclpy.RCLError, _rclpy.InvalidHandle):  # closed meanwhile: nobody waits
+            with contextlib.suppress(_rclpy.RCLError, _rclpy.InvalidHandle):  # closed meanwhile: nothing waits
                 self._guard.trigger_guard_condition()
 
     def wait(self, timeout_s: float) -> list[Waited]:
@@ -125,7 +125,7 @@ class RosLoop:
         return [self._by_pointer[pointer] for pointer in ready]
 
     def close(self) -> None:
-        """Destroy the node and everything on it, and leave the domain."""
+        """Destroy the node and all its entities, and leave the domain."""
         self._wait_set = None
         self._guard.destroy_when_not_in_use()
         self.node.destroy_node()

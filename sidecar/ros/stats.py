@@ -1,4 +1,4 @@
-"""Counters of the ROS bridge. Written by its one thread; a scrape copies (`dict(...)`) before it iterates.
+"""Holds the counters of the ROS bridge. Its one thread writes them; a scrape copies (`dict(...)`) before it iterates.
 
 This file imports no rclpy, so that the metrics can be described where no ROS is installed.
 """
@@ -31,32 +31,32 @@ class BridgeStats:
     refused: Counter[tuple[ServiceName, str]] = field(default_factory=Counter)
     """Cloud: (service, reason: RejectReason's name in lower case)."""
     abandoned: Counter[ServiceName] = field(default_factory=Counter)
-    """Cloud: requests whose answer nobody waits for any more."""
+    """Cloud: requests whose answer is no longer awaited."""
     fallbacks: Counter[tuple[ServiceName, str]] = field(default_factory=Counter)
     """Robot: (service, outcome: one of `sidecar.core.robot.fallback.fallbacks.OUTCOMES`)."""
     fallback_up: dict[ServiceName, bool] = field(default_factory=dict)
-    """Robot: services with a fallback; whether it can be asked. Replaced, never changed."""
+    """Robot: whether the fallback of each service that has one can be called. Replaced, never changed."""
     fallback_takes_s: dict[ServiceName, float] = field(default_factory=dict)
-    """Robot: seconds that their fallbacks are expected to take. Replaced, never changed."""
+    """Robot: seconds that the fallback of each such service is expected to take. Replaced, never changed."""
     dropped: Counter[str] = field(default_factory=Counter)
-    """Events and messages by the reason they were dropped for."""
+    """Dropped events and messages, by reason."""
     errors: Counter[str] = field(default_factory=Counter)
-    """Failures of rmw or of the bridge itself, by where they happened."""
+    """Failures of rmw or of the bridge itself, by place."""
     pending: int = 0
     """Robot: applications' requests without an answer. Cloud: requests at local servers or waiting for them."""
     answers_paced: int = 0
-    """Robot: answers held back for a moment so that the client's queue does not overflow."""
+    """Robot: answers held back briefly so that the client's queue does not overflow."""
     requests_paced: int = 0
     """Cloud: requests held back so that the server's queue does not overflow."""
     scans: int = 0
     """Looks at the ROS graph."""
     left_alone: dict[ServiceName, tuple[str, ...]] = field(default_factory=dict)
-    """Robot: offered services that other nodes already serve here, and those nodes. Replaced, never changed."""
+    """Robot: offered services that other nodes already serve here, with those nodes. Replaced, never changed."""
     missing_types: dict[ServiceName, str] = field(default_factory=dict)
-    """Services that are not carried because of their type, and that type. Replaced, never changed."""
+    """Services not carried because of their type, with that type. Replaced, never changed."""
     mismatched: frozenset[ServiceName] = frozenset()
-    """Cloud: services with a server that rmw does not connect with us: its QoS does not fit, or it has just come."""
+    """Cloud: services with a server that rmw has not connected to us: its QoS is incompatible, or it is new."""
     silent: frozenset[ServiceName] = frozenset()
-    """Cloud: services all of whose servers, as the ROS graph shows them, ended or show no sign of life."""
+    """Cloud: services all of whose servers in the ROS graph ended or show no sign of life."""
     carried: frozenset[ServiceName] = frozenset()
     """Robot: proxied services that exist. Cloud: services offered to robots."""

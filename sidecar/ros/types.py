@@ -1,7 +1,7 @@
-"""Service types by name.
+"""Loads service types by name.
 
-The name of a type comes from another machine, so only the form `package/srv/Name` is looked up: never a module of
-any other kind.
+The name of a type comes from another machine, so only the form `package/srv/Name` is looked up, never a module of any
+other kind.
 """
 
 from __future__ import annotations
@@ -20,12 +20,12 @@ _SERVICE_TYPE = re.compile(r"([a-z][a-z0-9_]{0,254})/srv/([A-Z][A-Za-z0-9]{0,254
 
 
 class TypeNotInstalledError(RosBridgeError):
-    """The type may exist, but not in this environment; installing its package cures it."""
+    """The type may exist, but not in this environment; installing its package fixes it."""
 
 
 @dataclass(frozen=True, slots=True)
 class ServiceType:
-    """A service type of this environment with its type support loaded."""
+    """A service type of this environment, its type support loaded."""
 
     name: str
     service: Any
@@ -44,7 +44,7 @@ def load_service_type(name: str) -> ServiceType:
     try:
         module = importlib.import_module(f"{package}.srv")
         service = getattr(module, short_name)
-    # Importing runs the package's own code, which may fail in any way.
+    # The import runs the package's own code, which may fail in any way.
     except Exception as error:
         raise TypeNotInstalledError(
             f"service type {name} is not installed here ({error}): install the ROS package {package!r}"
@@ -53,7 +53,7 @@ def load_service_type(name: str) -> ServiceType:
     try:
         for generated in (service, service.Request, service.Response):
             check_for_type_support(generated)
-    # The type support is generated code that loads shared libraries: it fails in ways of its own.
+    # The type support is generated code that loads shared libraries; it may fail in any way.
     except Exception as error:
         raise TypeNotInstalledError(
             f"service type {name} is installed without usable type support ({error}): reinstall the package {package!r}"

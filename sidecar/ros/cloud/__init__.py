@@ -1,1 +1,1 @@
-"""The cloud's end: local servers, what waits for them, and whether they live."""
+"""Runs the cloud's end: local servers, the requests that wait for them, and whether the servers live."""

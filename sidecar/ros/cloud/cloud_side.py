@@ -1,4 +1,4 @@
-"""Cloud: which local services are offered to robots, and their requests at the local servers."""
+"""Offers a cloud's local services to robots, and runs the robots' requests on the local servers."""
 
 from __future__ import annotations
 
@@ -32,19 +32,19 @@ if TYPE_CHECKING:
     from sidecar.ros.stats import BridgeStats
 
 MAX_EXECUTIONS = 4096
-"""Requests at local servers or waiting for them; one robot may have half. More are refused as OVERLOADED, so that
-another server runs them."""
+"""Requests at local servers or waiting for them; one robot may have half. Further ones are refused as OVERLOADED, so
+that another server runs them."""
 MAX_CARRIED_SERVICES = 512
 """Services of the local graph that are offered; each costs DDS endpoints and a slot in every wait."""
 TYPE_RETRY_S = 30.0
-"""How often a type that is not installed is looked for again: someone may be installing it."""
+"""How often a type that is not installed is tried again: someone may be installing it."""
 SILENCE_S = 0.5
-"""A server that answers nothing for so long is asked whether it lives."""
+"""A server that answers nothing for this long is asked whether it lives."""
 TRUSTED_S = 5.0
-"""So long at most it counts as alive once it was heard, while its process is watched and no further request waits: each
-question makes every ROS process of the domain send something."""
+"""Longest time a heard server counts as alive, while its process is watched and no further request waits. It is long
+because each call makes every ROS process of the domain send something."""
 CHECK_EVERY_S = 0.25
-"""How often that is looked at while such a server has something to answer."""
+"""How often that is checked while such a server has something to answer."""
 
 log = logging.getLogger(__name__)
 
@@ -78,12 +78,12 @@ class CloudSide:
         self._roll_call = RollCall(loop.node, self._processes.wants_processor)
         self._names = NodeNames(loop.node, stats, limited_log)
         self._at_work: set[ServiceRunner] = set()
-        """Runners whose server has something to answer, or is dead as far as is known."""
+        """Runners whose server has something to answer, or seems dead."""
         self._in_doubt: frozenset[ServiceRunner] = frozenset()
-        """Those of them whose server has answered nothing for so long that it must be heard to count as alive."""
+        """Runners at work whose server has been silent for so long that it must be heard to count as alive."""
         self._check_at = 0.0
         self.look_is_due = False
-        """The graph should be looked at although it has not changed."""
+        """Whether a look at the graph is due although it has not changed."""
         self._paced: set[ServiceRunner] = set()
         """Runners with requests that wait for room at their server."""
 
@@ -159,7 +159,7 @@ class CloudSide:
             return
         runner, execution = known
         runner.abandon(execution)
-        self._paced.add(runner)  # there may be room now, for those that wait
+        self._paced.add(runner)  # there may be room now for waiting requests
         self._stats.abandoned[runner.name] += 1
         if event.awaited and execution.number is None:
             why = "its time here was over before the server had room for it"
@@ -175,7 +175,7 @@ class CloudSide:
         return known
 
     def _cancel(self, event: CancelExecution) -> None:
-        """The robot has its answer: what its server has not got yet needs not run."""
+        """Drop a request that has not reached its server yet: the robot has its answer."""
         known = self._executions.get(event.execution)
         if known is None:
             return  # it was answered a moment ago
@@ -197,17 +197,17 @@ class CloudSide:
         self._refuse_executions([execution], runner.name, RejectReason.OVERLOADED, why)
 
     def _stray(self, _runner: ServiceRunner) -> None:
-        """An answer to an abandoned request, or a second answer because two nodes serve one name."""
+        """Count an answer to an abandoned request, or a second answer because two nodes serve one name."""
         self._stats.dropped["answer_without_execution"] += 1
 
     # -- what the graph shows ------------------------------------------------------------------------------------
 
     def settling(self) -> bool:
-        """Whether another look at the graph should follow soon, although it does not change."""
+        """Return whether another look at the graph should follow soon, even if it does not change."""
         return any(not runner.server.ready for runner in self._runners.values())
 
     def look(self) -> Iterator[None]:
-        """Compare the graph with the clients, in small steps; tell the data plane what is offered from now on."""
+        """Compare the graph with the clients, in small steps; tell the data plane what is now offered."""
         self._names.begin_look()
         served = yield from graph.scan(self._loop.node, self._names.name_of, self._is_in_rules, time.monotonic())
         self._stats.scans += 1
@@ -260,19 +260,19 @@ class CloudSide:
     def _choose_type(self, name: ServiceName, used: str | None, nodes: dict[str, frozenset[str]]) -> str:
         """Choose among several types of one service: the one in use stays while a server of it may live.
 
-        `nodes`: type -> nodes that serve it. Of nodes that share a name, as a dead server and the one that took its
-        place, rmw shows the services of one only.
+        `nodes` maps a type to the nodes that serve it. Of nodes that share a name, such as a dead server and its
+        replacement, rmw shows the services of one only.
         """
         endpoints = graph.server_endpoints(self._loop.node, name, self._names.name_of, time.monotonic())
-        living = set(nodes.keys() - endpoints.keys())  # rmw is not DDS, or the graph changes right now
+        living = set(nodes.keys() - endpoints.keys())  # rmw is not DDS, or the graph is just changing
         for kind, known in endpoints.items():
             for endpoint in known:
-                self._processes.watch(endpoint)  # also those that are not in use: they may be chosen later
-            # Silence is not enough: who stands still may have work, and goes on with it.
+                self._processes.watch(endpoint)  # also those not in use: they may be chosen later
+            # Silence is not enough: a stopped server may have work, and resumes it.
             if any(is_known and not self._processes.has_ended(endpoint) for endpoint, is_known in known.items()):
                 living.add(kind)
         candidates = living or nodes.keys()
-        # Else the choice is at least the same every time.
+        # If none is in use, the choice is at least the same every time.
         chosen = used if used is not None and used in candidates else min(candidates)
         if len(living) < 2:
             self._several_types.discard(name)
@@ -283,7 +283,7 @@ class CloudSide:
         return chosen
 
     def _look_at(self, runner: ServiceRunner, now: float) -> None:
-        """A server that is gone, though another came since, will not answer what it was asked."""
+        """Look at a runner's servers; give up its executions if its server is gone, even if another replaced it."""
         if runner.server.look(self._is_dead, now):
             log.warning("service %s: its server is gone or was replaced by another", runner.name)
             self._give_up_executions(runner, "the server was replaced")
@@ -293,7 +293,7 @@ class CloudSide:
             self._processes.watch(endpoint)
 
     def _notice_several_servers(self, runner: ServiceRunner, nodes: frozenset[str]) -> None:
-        """ROS gives each request to all servers of a name: at most once on each, but more than once here."""
+        """Warn of several servers: ROS gives a request to all of a name, at most once each, so it runs repeatedly."""
         name = runner.name
         # Nodes may share a name, and some may be dead.
         servers = runner.server.living if runner.server.endpoints else len(nodes)
@@ -305,7 +305,7 @@ class CloudSide:
                 "service %s has %d servers here%s: each request runs on all of them, the first answer counts",
                 name,
                 servers,
-                f" ({', '.join(sorted(nodes))})" if nodes else "",  # rmw may show only the other type of a node's name
+                f" ({', '.join(sorted(nodes))})" if nodes else "",  # rmw may show only the other type for a node name
             )
 
     def _open_runner(self, name: ServiceName, type_name: str) -> None:
@@ -377,9 +377,9 @@ class CloudSide:
     # -- whether the servers live -----------------------------------------------------------------------------------
 
     def _is_dead(self, endpoint: bytes) -> bool:
-        """Whether it ended, or is silent and was not before.
+        """Return whether the endpoint's process ended, or fell silent after it had been heard.
 
-        One that has only just started answers nothing either, until it has found us: on a busy machine in seconds.
+        A process that just started also answers nothing until it has found us, which takes seconds on a busy machine.
         """
         if self._processes.has_ended(endpoint):
             return True
@@ -387,9 +387,9 @@ class CloudSide:
         return proved and self._roll_call.is_silent(endpoint)
 
     def _is_alive_since(self, runner: ServiceRunner, since: float) -> bool:
-        """Whether one of its servers lives: its end would have been noticed, or it was heard since then.
+        """Return whether one of its servers lives: its end would have been noticed, or it was heard since `since`.
 
-        A process that was not seen to end may stand still all the same: that it answers nothing puts it in doubt.
+        A process that was not seen to end may still be stopped: if it answers nothing, it is in doubt.
         """
         endpoints = runner.server.endpoints
         in_doubt = runner in self._in_doubt
@@ -400,12 +400,12 @@ class CloudSide:
         )
 
     def _notice_ends(self) -> None:
-        """What was handed to a process that ended is lost; what waits for it another server may run."""
+        """Give up what was handed to processes that ended; another server may run what still waits for them."""
         ended = self._processes.has_ended
         hit = [
             runner
             for runner in self._runners.values()
-            # Those that were silent before were struck out then, and kept what they had.
+            # Servers that fell silent earlier were struck out then, but kept their requests.
             if runner.server.strike_out(ended) or (runner.pending and runner.server.is_over(ended))
         ]
         if hit:
@@ -416,7 +416,7 @@ class CloudSide:
         self.look_is_due = True  # for those of another type
 
     def _notice_silence(self) -> None:
-        """What was handed to a server that shows no sign of life may still be answered; the rest need not wait."""
+        """Refuse what waits for servers that show no sign of life; what they already have may still be answered."""
         why = "the server shows no sign of life"
         hit = [runner for runner in self._runners.values() if runner.server.strike_out(self._is_dead)]
         if hit:
@@ -429,7 +429,7 @@ class CloudSide:
         self.look_is_due = True  # for those that are heard again
 
     def _endpoints_to_ask(self, now: float) -> list[bytes]:
-        """Ids of servers whose silence may mean their death, and of those that were silent until now."""
+        """Return the ids of servers whose silence may mean that they are dead, and of those found silent before."""
         self._at_work = {runner for runner in self._at_work if runner.silent_since is not None or runner.server.lost}
         self._in_doubt = frozenset(
             runner
@@ -451,7 +451,7 @@ class CloudSide:
             return True
         if not self._processes.watches(endpoint):
             return True
-        # Nobody waits, and its end would be noticed: the longer it has been at work, the rarer.
+        # Nothing waits, and its end would be noticed: ask more rarely the longer it has been at work.
         return not self._roll_call.has_heard(endpoint, now - min((now - silent_since) / 2.0, TRUSTED_S))
 
     # -- time ----------------------------------------------------------------------------------------------------
@@ -466,14 +466,14 @@ class CloudSide:
         return min(dues, default=None)
 
     def on_timer(self, now: float) -> None:
-        """Notice who died; send the requests that waited long enough for a server that answers nothing."""
+        """Notice dead servers; send the requests that waited long enough for a server that answers nothing."""
         if self._processes.take_ended():
             self._notice_ends()
         if self._at_work and now >= self._check_at:
             if self._roll_call.turn(self._endpoints_to_ask(now), now):
                 self._notice_silence()
             self._check_at = now + (POLL_S if self._roll_call.under_way else CHECK_EVERY_S)
-            self._paced |= self._at_work  # who was heard may get more than it answers
+            self._paced |= self._at_work  # a server that was heard may get more than it answers
         if self._names.turn(now):
             self.look_is_due = True
         for runner in tuple(self._paced):
@@ -484,7 +484,7 @@ class CloudSide:
                 runner.release(now)
 
     def close(self) -> None:
-        """Offer nothing any more and refuse what is running."""
+        """Withdraw all offers and refuse what is running."""
         self._offers = ()
         self._stats.carried = frozenset()
         self._data_plane.set_offers(())
@@ -494,7 +494,7 @@ class CloudSide:
         for name in tuple(self._runners):
             runner = self._runners.pop(name)
             sent, unsent = runner.take_back()
-            # Those at the server may have run; the rest another server may run.
+            # Those at the server may have run; another server may run the rest.
             self._refuse_executions(sent, name, RejectReason.SERVER_LOST, "the sidecar is going away")
             self._refuse_executions(unsent, name, RejectReason.DRAINING, "the sidecar is going away")
             runner.close()

@@ -1,4 +1,4 @@
-"""One server of the local graph, as its client sees it: requests go in and answers come out, each with rmw's number."""
+"""Wraps the client of one service of the local graph: requests go in and answers come out, with rmw's numbers."""
 
 from __future__ import annotations
 
@@ -18,17 +18,17 @@ if TYPE_CHECKING:
     from sidecar.ros.types import ServiceType
 
 TAKEN_AT_ONCE = 32
-"""Answers taken from one server before the others have their turn."""
+"""Answers taken from one server before the next has its turn."""
 SETTLES_S = 0.2
-"""A server that came is asked so long after its node is known: until then it may not know of our client, and DDS takes
-up to 2 s to give it what it missed (measured with servers killed and started again)."""
+"""How long after its node is known a new server gets requests. Until then it may not know our client, and DDS takes up
+to 2 s to deliver what it missed (measured with servers killed and restarted)."""
 
 
 class LocalServer:
     """A client of the service `name`."""
 
     def __init__(self, node: Any, name: ServiceName, service_type: ServiceType, name_of: NameOf) -> None:
-        """Raises RosBridgeError: rmw refuses."""
+        """Create the client; raise RosBridgeError if rmw refuses."""
         self.name = name
         self.type = service_type
         self._node = node
@@ -40,16 +40,16 @@ class LocalServer:
             raise RosBridgeError(f"rmw refuses a client of {name}, type {service_type.name}: {error}") from error
         self._pointer: int = self._client.handle.pointer
         self.endpoints: frozenset[bytes] = frozenset()
-        """DDS ids of all of its type that the graph shows for it, to tell a restarted one from the old one; empty where
-        rmw is not DDS."""
+        """DDS ids of all its servers of this type in the graph, which tell a restarted one from the old one; empty
+        where rmw is not DDS."""
         self._alive: frozenset[bytes] = frozenset()
         self._asked: frozenset[bytes] = frozenset()
-        """Those who may still have to answer something."""
+        """Endpoints that may still owe answers."""
         self._usable_at: float | None = None
         self._matched = False
         self._looked = False
         self.ready = False
-        """Whether requests may be sent: before, rmw would drop them without a word, or nobody is there."""
+        """Whether requests may be sent; otherwise rmw would silently drop them, or no server is there."""
 
     @property
     def handle(self) -> Any:
@@ -58,34 +58,34 @@ class LocalServer:
 
     @property
     def lost(self) -> bool:
-        """True while all that the graph shows for it are dead."""
+        """True while all its servers in the graph are dead."""
         return bool(self.endpoints) and not self._alive
 
     @property
     def mismatched(self) -> bool:
-        """Whether one lives and rmw does not connect it with us: its QoS does not fit, or it came a moment ago."""
+        """Whether a server lives that rmw has not connected to us: its QoS is incompatible, or it is new."""
         return bool(self._alive) and not self.ready
 
     @property
     def living(self) -> int:
-        """How many of those that the graph shows live; each of them gets every request."""
+        """Number of live servers in the graph; each of them gets every request."""
         return len(self._alive)
 
     @property
     def only(self) -> bytes | None:
-        """The one that lives, or all are silent and the graph shows but this one: whoever answers is that one."""
+        """The only server that can be the one that answers: the only live one or, if none lives, the only one shown."""
         answering = self._alive or self.endpoints
         return next(iter(answering)) if len(answering) == 1 else None
 
     def is_usable(self, now: float) -> bool:
-        """Whether one of those that the graph shows lives and knows of us by now."""
+        """Return whether a server in the graph lives and knows our client by now."""
         if not self.endpoints:
             return self._looked
         return self._usable_at is not None and now >= self._usable_at
 
     def look(self, is_dead: Callable[[bytes], bool], now: float) -> bool:
-        """Look at the graph; returns whether all that were there at the last look are gone, and will answer nothing."""
-        # A node that serves the name with another type gets nothing of what we send, and answers nothing.
+        """Look at the graph; return whether all servers of the last look are gone, and so will answer nothing."""
+        # A node that serves the name with another type gets none of our requests, and answers nothing.
         known = graph.server_endpoints(self._node, self.name, self._name_of, now).get(self.type.name, {})
         self.endpoints = frozenset(known)
         self._looked = True
@@ -94,21 +94,21 @@ class LocalServer:
             self._usable_at = now + SETTLES_S if alive else None
             self._matched = False
         self._alive = alive
-        # A silent one keeps what it has until another takes its place, or until it is gone from the graph.
+        # A silent server keeps its requests until another takes its place, or until it is gone from the graph.
         went = bool(self._asked) and not self._asked & (alive or self.endpoints)
         if went or alive:
             self._asked = alive
-        # Asked until it is so: rmw says no again for a moment whenever another node begins to serve the name.
+        # Once true, it stays: rmw briefly says no again whenever another node begins to serve the name.
         self._matched = self._matched or bool(self._client.handle.service_server_is_available())
         self.ready = self._matched and self.is_usable(now)
         return went
 
     def is_over(self, has_ended: Callable[[bytes], bool]) -> bool:
-        """Whether all that the graph shows for it have ended, and so answer nothing more."""
+        """Return whether all its servers in the graph have ended, and so will answer nothing more."""
         return bool(self.endpoints) and all(has_ended(endpoint) for endpoint in self.endpoints)
 
     def strike_out(self, is_dead: Callable[[bytes], bool]) -> bool:
-        """Some process died, or is silent; returns whether nobody is left to ask."""
+        """Strike out the dead after some process died or fell silent; return whether the last live one went."""
         alive = frozenset(endpoint for endpoint in self._alive if not is_dead(endpoint))
         went = bool(self._alive) and not alive
         self._alive = alive
@@ -118,11 +118,11 @@ class LocalServer:
         return went
 
     def send(self, request: Message) -> int:
-        """Send a request; returns its number. Raises RosBridgeError."""
+        """Send a request and return its number; raise RosBridgeError on failure."""
         return send_request(self._pointer, request)
 
     def take(self) -> Iterator[tuple[int, bytes]]:
-        """Yield the answers that have arrived, some of many: (number of the request, bytes)."""
+        """Yield the answers that have arrived, a limited number at a time: (number of the request, bytes)."""
         for _ in range(TAKEN_AT_ONCE):
             taken = take_response(self._pointer, self.type.response)
             if taken is None:

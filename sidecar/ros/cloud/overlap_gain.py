@@ -1,11 +1,11 @@
-"""Whether a server that works on several requests at one moment does more for it.
+"""Finds out whether a server that works on several requests at once gains anything from it.
 
-Threads that share one processor, as those of a Python interpreter, have many requests in work and do no more than one
-thread does. So now and then a server that is seen to work on several gets a quarter as many for some answers. If its
-threads are worth something, it does a quarter as much then; if they share a processor, as much as before. The trial
-takes as many answers as it needs to tell, as service times may vary, and only two such verdicts in a row count.
+Threads that share one processor, like those of a Python interpreter, have many requests in work but do no more than one
+thread. So now and then a server that is seen to work on several gets a quarter as many for some answers. If its threads
+are worth something, it then does a quarter of the work; if they share a processor, as much as before. As service times
+may vary, a trial takes as many answers as the verdict needs, and only two verdicts of no gain in a row count.
 
-Answers by time are compared, not what requests took: those that take longest are not answered before the trial ends.
+Rates of answers are compared, not service times: the longest requests are not answered before the trial ends.
 """
 
 from __future__ import annotations
@@ -15,21 +15,21 @@ import math
 from sidecar.ros.cloud.service_times import ServiceTimes
 
 FEWER = 4
-"""A trial is with one such part of what is in work at once."""
+"""A trial divides the requests in work at once by this."""
 LEAST_ANSWERS, MOST_ANSWERS = 16, 128
-"""Of a trial. It ends as soon as the answers tell ..."""
+"""Length of a trial in answers. It ends as soon as the answers tell ..."""
 SURE = 2.0
-"""... by so many standard errors. If they do not, the server is believed to gain."""
+"""... by this many standard errors. If they never do, the server is taken to gain."""
 STEP = 1.25
-"""When the server works on so many times more, what it did before is no measure."""
+"""If the server works on this many times more, its earlier rate is no measure."""
 FIRST_TRIAL_AFTER, LAST_TRIAL_AFTER = 64, 8192
-"""Answers of several at once between two trials; four times as many after each that showed a gain."""
+"""Answers with several requests at once between two trials; four times as many after each that showed a gain."""
 FIRST_IGNORED, LAST_IGNORED = 512, 8192
-"""Answers for which overlaps do not count after they gained nothing; they double each time."""
+"""Answers during which overlaps do not count after they gained nothing; doubled each time."""
 
 
 class OverlapGain:
-    """Trials with one server. Times are seconds."""
+    """The trials of one server. Times are in seconds."""
 
     __slots__ = (
         "_after",
@@ -46,34 +46,34 @@ class OverlapGain:
 
     def __init__(self) -> None:
         self.at_once = 0
-        """How many the server should have for a trial; 0: none is under way."""
+        """Requests that the server should have during a trial; 0 if none is under way."""
         self._before = ServiceTimes(MOST_ANSWERS)
-        """Of those that were sent when the server had as many as it works on."""
+        """Service times of requests sent when the server had as many as it works on."""
         self._overlap = 1
-        """How many it worked on."""
+        """Requests that it worked on at once then."""
         self._after = self._until = FIRST_TRIAL_AFTER
         self._since = math.inf
-        """When the server came down to that many."""
+        """When the server's requests came down to `at_once`."""
         self._answers = 0
-        """Since then."""
+        """Answers since then."""
         self._doubted = False
         self._ignored = 0
         self._next_ignored = FIRST_IGNORED
 
     def of_use(self, overlap: int) -> int:
-        """How many at once it is of use to have in work at a server that works on so many, as far as is known."""
+        """Return how many requests at once are known to be useful at a server that works on `overlap`."""
         if self._ignored:
             return 1
         return min(overlap, FEWER) if self._doubted else overlap
 
     def sent(self, out: int, now: float) -> None:
-        """One was sent as one of so many."""
+        """Note that a request was sent as one of `out`."""
         if out < self.at_once or self._since > now:
             self._since = now
             self._answers = 0
 
     def answered(self, took_s: float, out: int, overlap: int, now: float) -> None:
-        """One is answered that was sent as one of `out`, by a server that works on so many at once."""
+        """Note an answer to a request sent as one of `out`, by a server that works on `overlap` at once."""
         overlap = self.of_use(overlap)
         if self._ignored:
             self._ignored -= 1
@@ -95,7 +95,7 @@ class OverlapGain:
                 self._answers = 0
 
     def _judge(self, now: float) -> None:
-        """Compare what the server does for fewer requests at once with what it did before."""
+        """Compare the server's rate with fewer requests at once to its rate before."""
         error = math.sqrt(self._before.variation * (1 / self._before.count + 1 / self._answers))
         if_none = self.at_once / self._overlap
         worth = self._before.rate * (now - self._since) / self._answers * if_none

@@ -1,9 +1,9 @@
-"""Which process of this host serves a DDS endpoint, so that its end can be watched.
+"""Finds the process of this host that serves a DDS endpoint, so that its end can be watched.
 
-An id holds 16 bits of a process id, in a namespace that may be another container's. So a process is believed to be
-the one only if it takes part in this ROS domain with Fast DDS: it holds the lock of a shared-memory port of the domain,
-or one of the domain's UDP ports. The locks can be seen of every user's processes, the ports only of processes whose
-files may be read.
+A DDS id holds 16 bits of a process id, in a namespace that may be another container's. So a process is accepted only if
+it takes part in this ROS domain with Fast DDS: it holds the lock of a shared-memory port of the domain, or one of the
+domain's UDP ports. The locks are visible for every user's processes, the ports only for processes whose files may be
+read.
 """
 
 from __future__ import annotations
@@ -24,12 +24,12 @@ _SHARED_MEMORY = Path("/dev/shm")  # noqa: S108 - where Fast DDS has its ports; 
 _PORT_LOCK = re.compile(r"fast(?:rtps|dds)_port(\d+)_el")
 _RUNNABLE = "R"
 _STOPPED = frozenset({"T", "t"})
-"""By a signal, or by a debugger (proc(5), stat)."""
+"""States of a process stopped by a signal or by a debugger (proc(5), stat)."""
 _UDP_TABLES = ("/proc/net/udp", "/proc/net/udp6")
 
 
 def open_process(endpoint: bytes, domain: int) -> int | None:
-    """Return a pidfd of the living process behind `endpoint`, or None where it can not be told for certain."""
+    """Return a pidfd of the live process behind `endpoint`, or None where it cannot be identified for certain."""
     bits = pid_bits(endpoint)
     if bits is None or not _sees_its_own_namespace():
         return None
@@ -40,7 +40,7 @@ def open_process(endpoint: bytes, domain: int) -> int | None:
         pidfd = os.pidfd_open(found[0])
     except OSError:
         return None
-    # Looked at once more: whoever had the id until now is the one that the pidfd stands for, if that still lives.
+    # Check once more: if the pidfd's process still lives, it has held the process id all along.
     if _takes_part(found[0], domain) and not has_ended(pidfd):
         return pidfd
     os.close(pidfd)
@@ -48,19 +48,19 @@ def open_process(endpoint: bytes, domain: int) -> int | None:
 
 
 def has_ended(pidfd: int) -> bool:
-    """True when the process is over."""
+    """Return True when the process has ended."""
     poll = select.poll()
     poll.register(pidfd, select.POLLIN)
     return bool(poll.poll(0))
 
 
 def wants_processor(pidfd: int) -> bool:
-    """True when a thread of the process runs or waits for a processor; a stopped or frozen one does not."""
+    """Return True when a thread of the process runs or waits for a processor; a stopped or frozen one does not."""
     with contextlib.suppress(OSError, ValueError, StopIteration):
         lines = Path(f"/proc/self/fdinfo/{pidfd}").read_text().splitlines()
         pid = int(next(line for line in lines if line.startswith("Pid:")).split()[1])
         if _state(Path(f"/proc/{pid}/stat")) in _STOPPED:
-            return False  # so are all its threads, perhaps very many
+            return False  # so are all its threads, of which there may be very many
         return any(_state(thread / "stat") == _RUNNABLE for thread in Path(f"/proc/{pid}/task").iterdir())
     return False
 
@@ -73,7 +73,7 @@ def _state(stat: Path) -> str:
 
 
 def _sees_its_own_namespace() -> bool:
-    """Whether the ids in /proc are those that the kernel takes from us."""
+    """Return whether the process ids in /proc are those of our own namespace, which system calls take."""
     try:
         return int(os.readlink("/proc/self")) == os.getpid()
     except (OSError, ValueError):

@@ -1,8 +1,8 @@
-"""How many requests a server works on at one moment, as answers out of order prove it.
+"""Counts how many requests a server works on at once, as proved by answers out of order.
 
-The requests of one client are taken in order. So when a later one is answered first, the earlier was in work by then:
-from when it is overtaken until it is answered. However much service times vary, a server that takes one request after
-the other is never seen to work on two.
+A server takes the requests of one client in order. So when a later one is answered first, the earlier was in work by
+then: at least from when it is overtaken until it is answered. However much service times vary, a server that takes one
+request after the other is never seen to work on two.
 """
 
 from __future__ import annotations
@@ -14,41 +14,41 @@ if TYPE_CHECKING:
     from collections.abc import Iterable
 
 REMEMBERED = 256
-"""Answers that are looked at: eight times what one server has at once ..."""
+"""Answers considered: eight times what one server has at once ..."""
 IN_ORDER = 64
-"""... unless so many were in order since: then threads have ended."""
+"""... unless this many were in order since: then threads have ended."""
 LOST_AFTER = 512
-"""What was overtaken by so many answers counts as lost. One thread of 16 may be busy for long with one request."""
+"""A request overtaken by this many answers counts as lost. One thread of 16 may be busy with one request for long."""
 
 
 class RequestOverlap:
-    """What the last answers of one server prove. Request numbers ascend."""
+    """The overlap that the last answers of one server prove. Request numbers ascend."""
 
     __slots__ = ("_events", "_highest", "_in_order", "_in_work", "_overtaken", "most")
 
     def __init__(self) -> None:
         self.most = 1
-        """The most requests that were in work at one moment."""
+        """The most requests that were in work at once."""
         self._highest = -1
         self._events = 0
         self._in_order = 0
-        """Answers since one that was overtaken was answered."""
+        """Answers since the last answer to an overtaken request."""
         self._in_work: deque[int] = deque(maxlen=REMEMBERED)
-        """For each of the last answers, how many requests are known to have been in work just before it."""
+        """Requests known to have been in work just before each of the last answers."""
         self._overtaken: dict[int, int] = {}
-        """Unanswered requests with a lower number than one that is answered, by the answer that first told."""
+        """Unanswered requests with a lower number than an answered one; for each, the first answer that overtook it."""
 
     @property
     def overtaken(self) -> int:
-        """Requests that are in work although later ones are answered; of a server that works on one at once, lost."""
+        """Requests in work although later ones are answered; at a server that works on one at a time they are lost."""
         return min(len(self._overtaken), self.most - 1)
 
     def given_up(self, number: int) -> None:
-        """Nobody waits for this request any more."""
+        """Note that this request is no longer awaited."""
         self._overtaken.pop(number, None)
 
     def answered(self, number: int, unanswered: Iterable[int]) -> None:
-        """The server answered one of its requests, and not yet these."""
+        """Note that the server answered request `number`, while these are still unanswered."""
         event = self._events
         self._events += 1
         self._in_work.append(1)

@@ -1,9 +1,9 @@
-"""Cloud: requests that wait for a local server, in the order in which they should run.
+"""Keeps requests that wait for a local server in the cloud, in the order in which they should run.
 
-What is more urgent goes first; then what can still make its deadline before what is late already; then the earlier
-deadline. The late are served last, not dropped: their robots still want the answers, until they expire. Those that will
-expire before they are answered come after all others: at a server that is overloaded for long, the oldest always are
-such, and it would work for nobody.
+More urgent requests go first; then those that can still make their deadline before late ones; then the earlier
+deadline. Late ones are served last, not dropped: their robots still want the answers until they expire. Requests that
+will expire before they are answered come after all others. At a server that is overloaded for long, the oldest always
+do, and it would work for nobody.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from collections.abc import Hashable
 
 REMOVED_SLACK = 64
-"""Removed requests that may lie in the heaps before they are swept out."""
+"""Removed requests that may remain in the heaps before they are swept out."""
 
 T = TypeVar("T", bound="Hashable")
 
@@ -31,22 +31,22 @@ class _Class(Generic[T]):
     fresh: list[tuple[float, int, T, float]] = field(default_factory=list)
     late: list[tuple[float, int, T, float]] = field(default_factory=list)
     hopeless: list[tuple[float, int, T, float]] = field(default_factory=list)
-    """By when they expire, the last first, in place of the deadline."""
+    """Ordered by expiry instead of deadline, the last to expire first."""
 
     def heaps(self) -> tuple[list[tuple[float, int, T, float]], ...]:
-        """Return all, the first to serve first."""
+        """Return all heaps in the order to serve them."""
         return self.fresh, self.late, self.hopeless
 
 
 class RequestQueue(Generic[T]):
-    """Requests by priority, lateness and deadline. Times are seconds; the caller caps their number."""
+    """Requests by priority, lateness and deadline. Times are in seconds; the caller limits the number of requests."""
 
     __slots__ = ("_classes", "_order", "_waiting")
 
     def __init__(self) -> None:
         self._classes: dict[Priority, _Class[T]] = {priority: _Class() for priority in sorted(Priority)}
         self._waiting: dict[T, None] = {}
-        """Those that the heaps hold, in order of arrival; what was removed stays in its heap until it comes up."""
+        """Waiting requests in order of arrival; a removed one stays in its heap until it reaches the top."""
         self._order = count()
 
     def __len__(self) -> int:
@@ -56,12 +56,12 @@ class RequestQueue(Generic[T]):
         return request in self._waiting
 
     def add(self, request: T, priority: Priority, deadline: float, expires: float) -> None:
-        """Let a request wait, until `remove` at the latest."""
+        """Queue a request, until `remove` at the latest."""
         self._waiting[request] = None
         heapq.heappush(self._classes[priority].fresh, (deadline, next(self._order), request, expires))
 
     def remove(self, request: T) -> None:
-        """It is not wanted any more."""
+        """Remove a request that is no longer wanted."""
         del self._waiting[request]
         held = sum(len(heap) for waiting in self._classes.values() for heap in waiting.heaps())
         if held > 2 * len(self._waiting) + REMOVED_SLACK:
@@ -71,9 +71,9 @@ class RequestQueue(Generic[T]):
                     heapq.heapify(heap)
 
     def take(self, now: float, hopeless_by: float, *, late_too: bool) -> tuple[T, bool] | None:
-        """Return the request whose turn it is and whether it is late; None if there is none of those wanted.
+        """Return the request whose turn it is and whether it is late, or None if none may be taken.
 
-        What expires until `hopeless_by` comes after all others, whatever their priority.
+        Late requests that expire by `hopeless_by` come after all others, whatever their priority.
         """
         for waiting in self._classes.values():
             self._sort_out(waiting, now, hopeless_by)
@@ -92,7 +92,7 @@ class RequestQueue(Generic[T]):
         return request
 
     def _sort_out(self, waiting: _Class[T], now: float, hopeless_by: float) -> None:
-        """Bring to the top of the heaps what may be taken."""
+        """Bring the requests that may be taken to the top of the heaps."""
         while waiting.fresh and (waiting.fresh[0][0] <= now or waiting.fresh[0][2] not in self._waiting):
             entry = heapq.heappop(waiting.fresh)
             if entry[2] in self._waiting:
@@ -105,7 +105,7 @@ class RequestQueue(Generic[T]):
             heapq.heappop(waiting.hopeless)
 
     def take_all(self) -> list[T]:
-        """Return all of them, in order of arrival, and let none wait any more."""
+        """Remove and return all requests, in order of arrival."""
         requests = list(self._waiting)
         self._waiting.clear()
         for waiting in self._classes.values():

@@ -1,21 +1,21 @@
-"""Requests to one local server, no more at once than it can work on and than its queue surely holds.
+"""Limits the requests at one local server to what it can work on at once and what its queue surely holds.
 
-A ROS server made with the default profile keeps the last 10 requests it has not taken yet; the 11th pushes the first
-one out without a trace. How many lie there cannot be asked, but follows from the answers: the requests of one client
-are taken in order, so an answer tells that its request and all earlier ones have left the queue. At most SAFE_SIZE
-later ones are let through; the rest wait here. An earlier one that is not answered yet is in work, and takes no room in
-the queue. From the silence of a server nothing is concluded: it may need a minute for each. Only what nobody waits for
-any more counts no longer once it is the oldest: it is what would be pushed out first.
+A ROS server with the default profile keeps the last 10 requests it has not taken yet; the 11th silently pushes out the
+first. There is no way to ask how many lie there, but the answers tell: a server takes the requests of one client in
+order, so an answer shows that its request and all earlier ones have left the queue. At most SAFE_SIZE later ones are
+let through; the rest wait here. An earlier one that is not answered yet is in work, and takes no room in the queue. A
+server's silence proves nothing: it may need a minute for each request. Only a request that is no longer awaited stops
+counting once it is the oldest, as it would be pushed out first.
 
-That is the most. As no request can be called back from a server's queue, where nothing more urgent overtakes it, only
-as many are let through as the server needs to be busy (`server_capacity.py`): one or two, if it takes one after the
-other. An answer may be lost, though, so after a silence one more is let through, and then another, each time after
-twice as long, provided that the server has shown a sign of life meanwhile: what goes to a dead one may have run there,
-and if that may happen only once, it is lost.
+That is the upper limit. No request can be called back from a server's queue, where nothing more urgent overtakes it. So
+only as many are let through as keep the server busy (`server_capacity.py`): one or two, if it takes one after the
+other. But an answer may be lost. So after a silence one more is let through, and then another, each time after twice as
+long, provided that the server has shown a sign of life meanwhile. A request sent to a dead server may have run there;
+if it may run only once, it is lost.
 
-What is late already when its turn comes, or would be when the server has done it, must not keep the server from what is
-not: after an outage a backlog comes first and what the robot asks now right behind it. So only one late request at a
-time is let through, as long as others may come.
+A request that is late when its turn comes, or would be when it is answered, must not keep the server from those that
+are not: after an outage a backlog comes first, and the robot's new requests right behind it. So only one late request
+at a time is let through, as long as others may come.
 """
 
 from __future__ import annotations
@@ -32,19 +32,19 @@ if TYPE_CHECKING:
     from sidecar.core.base.values import Priority
 
 STALL_TIMES = 3.0
-"""A silence lasts so many times what the server's requests usually take ..."""
+"""A silence lasts this many times the usual time of the server's requests ..."""
 SHORT_STALL_S = 0.1
-"""... but at least this long. So does the first one of a server of which nothing is known: one request may wait there,
-and the other may have been lost."""
+"""... but at least this long. The first silence of a server of unknown speed lasts this long too: one request may wait
+there, and the other may have been lost."""
 STALL_S = 1.0
-"""Further silences of such a server are twice this, four times, and so on. A late request that is out for STALL_S is no
-reason any more to hold the next one back."""
+"""Further silences of such a server last twice this, four times this, and so on. A late request that has been out for
+STALL_S no longer holds back the next one."""
 LATE_ONLY_S = 2.0
-"""When nothing but late requests came for so long, they may fill the window: then the deadline is shorter than the
-way here, and one at a time would only make it worse."""
+"""When only late requests have come for this long, they may fill the window: then the deadline is shorter than the way
+here, and sending one at a time would only make it worse."""
 
 HOPELESS_TIMES = 1.5
-"""What expires within so many times what requests usually take is served last: it would be answered to nobody."""
+"""A request that expires within this many times the usual time is served last: its answer would come too late."""
 
 T = TypeVar("T", bound="Hashable")
 
@@ -54,7 +54,7 @@ def _lives(_since: float) -> bool:
 
 
 class RequestWindow(Generic[T]):
-    """Which requests may go to the server now. The caller sends what `release` yields and reports `sent`."""
+    """Decides which requests may go to the server now. The caller sends what `release` yields and reports `sent`."""
 
     __slots__ = (
         "_alive_since",
@@ -74,44 +74,44 @@ class RequestWindow(Generic[T]):
     )
 
     def __init__(self, first: int = FIRST_LIMIT, alive_since: Callable[[float], bool] = _lives) -> None:
-        """`alive_since`: whether the server has shown a sign of life since then (s), other than an answer."""
+        """Take `alive_since`: whether the server has shown a sign of life, other than an answer, since then (s)."""
         self._alive_since = alive_since
         self._capacity = ServerCapacity(first)
         self._waiting: SharedQueue[T] = SharedQueue()
         self._unseen: deque[int] = deque()
         """Numbers of the sent requests that may still lie in the server's queue, ascending."""
         self._given_up: set[int] = set()
-        """Those of them that nobody waits for any more."""
+        """Those of them that are no longer awaited."""
         self._highest_answered = -1
         self._last_sent = -1
         self._progress_at = 0.0
         self._silences = 0
-        """How often one more was let through since the last answer."""
+        """How often one more request was let through since the last answer."""
         self._freed = False
-        """Something was given up since `release` was called."""
+        """Whether something was given up since the last `release`."""
         self._late_released = False
-        """Whether what `release` yielded last was late."""
+        """Whether the request that `release` yielded last was late."""
         self._late_number: int | None = None
-        """The late request at the server that was sent last."""
+        """The last late request sent that is still at the server."""
         self._next_late_at = 0.0
-        """When the next one may go although that one was not answered."""
+        """When the next late one may go although that one is not answered."""
         self._only_late_since: float | None = None
 
     @property
     def waiting(self) -> int:
-        """How many requests wait."""
+        """Number of waiting requests."""
         return len(self._waiting)
 
     @property
     def size(self) -> int:
-        """How many requests the server may have that it was not seen to have taken."""
+        """Number of requests that the server may have without being seen to have taken them."""
         wanted = self._capacity.limit - self._capacity.overtaken
         return max(1, min(wanted + self._silences, SAFE_SIZE))
 
     def add(
         self, request: T, priority: Priority, deadline: float, expires: float, now: float, robot: Hashable = None
     ) -> None:
-        """Let a robot's request wait for its turn; the caller removes it when it `expires`."""
+        """Queue a robot's request for its turn; the caller removes it when it `expires`."""
         self._waiting.add(request, robot, priority, deadline, expires)
         if deadline > now + self._capacity.usual_s:
             self._only_late_since = None
@@ -119,15 +119,15 @@ class RequestWindow(Generic[T]):
             self._only_late_since = now
 
     def holds(self, request: T) -> bool:
-        """Whether the request still waits."""
+        """Return whether the request still waits."""
         return request in self._waiting
 
     def remove(self, request: T) -> None:
-        """A waiting request is not wanted any more."""
+        """Remove a waiting request that is no longer wanted."""
         self._waiting.remove(request)
 
     def take_all(self) -> list[T]:
-        """Return all that wait, in order of arrival, and let none wait any more."""
+        """Remove and return all waiting requests, in order of arrival."""
         return self._waiting.take_all()
 
     def release(self, now: float) -> Iterator[T]:
@@ -146,7 +146,7 @@ class RequestWindow(Generic[T]):
             yield request
 
     def sent(self, number: int, now: float) -> None:
-        """rmw gave `number` to the request just sent; numbers ascend."""
+        """Note that rmw gave `number` to the request just sent; numbers ascend."""
         if not self._unseen:
             self._progress_at = now
         self._last_sent = number
@@ -157,7 +157,7 @@ class RequestWindow(Generic[T]):
             self._next_late_at = now + STALL_S
 
     def answered(self, number: int, now: float) -> None:
-        """The server answered request `number`; an answer to what it was never sent tells nothing."""
+        """Note that the server answered request `number`; ignore an answer to a request that was never sent."""
         if number > self._last_sent:
             return
         self._progress_at = now
@@ -171,7 +171,7 @@ class RequestWindow(Generic[T]):
             self._drop_given_up()
 
     def given_up(self, number: int) -> None:
-        """Nobody waits for the answer to request `number` any more."""
+        """Note that the answer to request `number` is no longer awaited."""
         if number == self._late_number:
             self._late_number = None
         if number > self._highest_answered:
@@ -198,7 +198,7 @@ class RequestWindow(Generic[T]):
         return min(self._next_late_at, self._only_late_since + LATE_ONLY_S)
 
     def _silent_at(self) -> float | None:
-        """When one more may go although the window is full; None: never, or it is open, or the server may be dead."""
+        """Return when one more may go although the window is full; None: never, or open, or the server may be dead."""
         if not self.size <= len(self._unseen) < SAFE_SIZE or not self._alive_since(self._progress_at):
             return None
         if self._capacity.usual_s:
@@ -211,5 +211,5 @@ class RequestWindow(Generic[T]):
         if self._late_number is None or now >= self._next_late_at:
             return True
         if len(self._unseen) + self._capacity.overtaken <= self._capacity.proved > 1:
-            return True  # a thread is idle or will be soon; one more than are proved, so that further threads show
+            return True  # a thread is idle or soon will be; one more than proved, so that further threads show
         return self._only_late_since is not None and now - self._only_late_since >= LATE_ONLY_S

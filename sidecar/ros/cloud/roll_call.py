@@ -1,6 +1,6 @@
-"""Asking the ROS processes of the domain whether they live: a process id tells of an end, but not of a standstill.
+"""Asks the ROS processes of the domain whether they live; a process id shows that one ended, not that it is stopped.
 
-`discovery_topic.py` says how they are asked.
+`discovery_topic.py` explains how they are asked.
 """
 
 from __future__ import annotations
@@ -16,56 +16,56 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
 
 CALL_S = 0.7
-"""How long a call waits for those that it is about. They take 20 ms on a machine with five processes for each core."""
+"""How long a call waits for the processes it asks. They take 20 ms on a machine with five processes per core."""
 CALL_EVERY_S = 1.0
-"""From one call to the next, if the one before was answered; otherwise at once."""
+"""Time between calls, if the one before was answered; otherwise the next follows at once."""
 CALLS_MISSED = 2
-"""Who answers none of so many calls in a row is taken for dead until it answers one. A call counts only for those that
-do not wait for a processor: on a machine that is too busy, everybody answers late."""
+"""A process that answers none of this many calls in a row counts as dead until it answers. A call counts only for
+processes that do not wait for a processor: on an overloaded machine all answer late."""
 POLL_S = 0.02
 
 
 class RollCall:
-    """One call at a time. All methods belong to the ROS thread."""
+    """Makes one call at a time. All methods belong to the ROS thread."""
 
     def __init__(self, node: Any, wants_processor: Callable[[bytes], bool]) -> None:
-        """`wants_processor`: whether a participant's process is known to run, or to wait for a processor."""
+        """Take `wants_processor`: whether a participant's process is known to run, or to wait for a processor."""
         self._topic = DiscoveryTopic(node)
         self._wants_processor = wants_processor
         self._asked: set[bytes] = set()
-        """Participants of the present call that have not answered."""
+        """Participants of the current call that have not answered."""
         self._ends_at = 0.0
         self._next_at = 0.0
         self._missed: dict[bytes, int] = {}
         """Calls in a row that a participant did not answer."""
         self._heard_at: dict[bytes, float] = {}
-        """When a participant answered last."""
+        """When each participant answered last."""
 
     def is_silent(self, endpoint: bytes) -> bool:
-        """Whether its participant answered none of the last calls."""
+        """Return whether the endpoint's participant answered none of the last calls."""
         return self._missed.get(participant_of(endpoint), 0) >= CALLS_MISSED
 
     def has_heard(self, endpoint: bytes, since: float) -> bool:
-        """Whether its participant answered since then, or cannot be asked at all."""
+        """Return whether the endpoint's participant answered since `since`, or cannot be asked at all."""
         return not self._topic.usable or self._heard_at.get(participant_of(endpoint), -math.inf) >= since
 
     def has_ever_heard(self, endpoint: bytes) -> bool:
-        """Whether its participant answered anything since the graph shows it."""
+        """Return whether the endpoint's participant has answered anything since it appeared in the graph."""
         return participant_of(endpoint) in self._heard_at
 
     def answered(self, endpoint: bytes, now: float) -> bool:
-        """It answered a request: as good as a call; True when `is_silent` changed."""
+        """Count an answer to a request like one to a call; return True when `is_silent` changed."""
         participant = participant_of(endpoint)
         self._heard_at[participant] = now
         return self._missed.pop(participant, 0) >= CALLS_MISSED
 
     @property
     def under_way(self) -> bool:
-        """Whether somebody was asked, and `turn` is wanted in POLL_S."""
+        """Whether a call is under way, so that `turn` is due in POLL_S."""
         return self._topic.is_open
 
     def turn(self, endpoints: Iterable[bytes], now: float) -> bool:
-        """Ask those behind `endpoints`, if it is time, and hear who answers; True when `is_silent` changed."""
+        """Ask those behind `endpoints` if a call is due, or hear the answers; return True when `is_silent` changed."""
         if not self._topic.is_open:
             return self._call({participant_of(endpoint) for endpoint in endpoints}, now)
         changed = self._hear(now)
@@ -82,13 +82,13 @@ class RollCall:
         return changed
 
     def keep(self, endpoints: Iterable[bytes]) -> None:
-        """Forget all others: the graph shows them no more."""
+        """Forget all others, which are gone from the graph."""
         wanted = {participant_of(endpoint) for endpoint in endpoints}
         self._missed = {participant: missed for participant, missed in self._missed.items() if participant in wanted}
         self._heard_at = {participant: at for participant, at in self._heard_at.items() if participant in wanted}
 
     def close(self) -> None:
-        """Ask nobody any more."""
+        """End the current call, if any."""
         self._end()
 
     def _call(self, participants: set[bytes], now: float) -> bool:

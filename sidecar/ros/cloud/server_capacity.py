@@ -1,17 +1,17 @@
-"""How many requests a local server should have at once, found from what its answers take.
+"""Finds how many requests a local server should have at once, from how long its answers take.
 
-What is sent too early stands in the server's queue, first in, first out, where nothing that is more urgent can overtake
-it. What is sent too late lets the server idle for the way to the sidecar and back. So the number is found by Little's
-law: with `n` requests at the server at a time that take `r` seconds each, where a request alone takes `a`, it does the
-work of `n * a / r` requests alone. Of a server that takes one after the other, that is 1, and a little more where the
-way there takes a part of `a`; of one with four threads 4. As long as it keeps pace with `n`, twice as many are tried.
+A request sent too early stands in the server's queue, first in, first out, where nothing more urgent can overtake it.
+One sent too late lets the server idle for the way to the sidecar and back. So the number follows from Little's law:
+with `n` requests at the server at a time that take `r` seconds each, where a request alone takes `a`, it does the work
+of `n * a / r` requests alone. For a server that takes one after the other, that is 1, or a little more where the way
+there is part of `a`; for one with four threads it is 4. As long as it keeps pace with `n`, twice as many are tried.
 
-Service times may vary, so means are compared, and only what is sure of them counts: where they vary much the law says
-little. Then answers out of order prove how many were in work at one moment (`request_overlap.py`), and one more than
-that may be there, unless that many gain nothing, as their threads share one processor (`overlap_gain.py`).
+Service times may vary, so means are compared, and only within their confidence: where times vary much, the law says
+little. Then answers out of order prove how many were in work at once (`request_overlap.py`). One more than that may be
+there, unless that many gain nothing because their threads share one processor (`overlap_gain.py`).
 
-`a` is measured where requests are too few to meet. Where no overlap tells more, the server is emptied for that now and
-then, and when it seems to have fallen behind: either its work became longer, or its threads fewer.
+`a` is measured when requests are too few to meet. Where no overlap tells more, the server is emptied to measure it now
+and then, and when it seems to have fallen behind: either its work became longer, or its threads fewer.
 """
 
 from __future__ import annotations
@@ -24,60 +24,60 @@ from sidecar.ros.cloud.request_overlap import RequestOverlap
 from sidecar.ros.cloud.service_times import ServiceTimes
 
 FIRST_LIMIT = 2
-"""One in work and one that is there when that is done."""
+"""One in work and one ready when that is done."""
 SAFE_SIZE = 8
 """Requests that a server's queue surely holds: rmw's default depth is 10, but the server may have other clients."""
 MOST_AT_ONCE = 32
-"""Also what DDS keeps of requests and of answers, and so what a killed server costs: until its lease ends, about 20 s,
-no request counts as delivered to all, and DDS keeps as many buffers until the client goes, each as long as the longest
-of those requests."""
+"""Also the depth of DDS's queues for requests and answers, and so the cost of a killed server. Until its lease ends,
+about 20 s, no request counts as delivered to all. DDS then keeps this many buffers until the client is destroyed, each
+as long as the longest of those requests."""
 WAITING_S = 0.005
-"""Work that may wait at the server, for it not to idle on the way to the sidecar and back: on a busy host a few times
-the 0.2 to 0.5 ms of a call. At least one request waits ..."""
+"""Work that may wait at the server so that it does not idle for the way to the sidecar and back: on a busy host, a few
+times the 0.2 to 0.5 ms of a call. At least one request waits ..."""
 LONG_S = 0.1
-"""... unless requests take longer than this alone: then the server idles for a few per cent of its time at most, and
-order is worth more."""
+"""... unless a request alone takes longer than this: then the server idles for a few per cent of its time at most, and
+the order of requests is worth more."""
 KEEPS_PACE = 0.4
-"""With no more than so many requests waiting at the server for sure, more at once are tried: twice as many until it
-falls behind for the first time, then one more."""
+"""While no more than this many requests surely wait at the server, more at once are tried: twice as many until it first
+falls behind, then one more."""
 ROUNDING = 0.25
-"""Of a server that works on one at once, the law gives a little more by chance."""
+"""Tolerance: for a server that works on one at a time, the law may give a little more by chance."""
 LEAST_ROUND = 4
-"""Answers by which the limit is judged, or as many as the limit. Once it fell behind, twice as many of either."""
+"""Minimum answers to judge the limit by, or the limit itself if higher; twice that once the server fell behind."""
 ALONE_KEPT = 8
-"""Requests that were alone have at least one part of so many in their mean."""
+"""Each request alone has at least a weight of one over this in their mean."""
 SURER = 4
-"""Rounds that are waited for if that may show that the limit is right."""
+"""Rounds to wait for if they may show that the limit is right."""
 LEAST_ALONE = 4
-"""So many are measured once it matters how much they vary."""
+"""Requests alone to measure once their variation matters."""
 SURE = 2.0
-"""Standard errors by which a mean may be wrong."""
+"""Standard errors that a mean may be off by."""
 USUAL_WEIGHT = 0.125
-"""Of the newest answer, in the mean of what all take."""
+"""Weight of the newest answer in the mean time of all answers."""
 ALONE_FOR_S = 0.02
-"""Requests are sent one by one until they took this long together, one at least."""
+"""To measure the time alone, at least one request is sent alone, until they took this long together."""
 STALE_AFTER, STALE_S, STALE_TIMES = 32, 1.0, 16
-"""After so many answers, so long, and so many times what a request alone takes, that may have changed: it is measured
-again before the limit is lowered for it. The times bound what that costs."""
+"""Age of the time alone, in answers, seconds and multiples of itself, after which it may have changed. It is then
+measured again before the limit is lowered because of it. The multiple bounds what that costs."""
 ALONE_AGAIN_S = 10.0
 FIRST_ROUNDS, MOST_ROUNDS = 8, 64
-"""The time alone is measured again after so long and so many answers for each request at once; these double each time.
-That costs a few per cent of the work of a server with many threads, nothing of one that takes one after the other."""
+"""The time alone is measured again after ALONE_AGAIN_S and this many answers per request at once, doubled each time.
+That costs a server with many threads a few per cent of its work, and one that takes one after the other nothing."""
 FIRST_TRY_AFTER, LAST_TRY_AFTER = 4, 64
-"""Answers to single requests after which two at once are tried again; they double each time."""
+"""Answers to single requests after which two at once are tried again; doubled each time."""
 
 
 @dataclass(slots=True)
 class _Sent:
     at: float
     out: int
-    """How many the server may have had by then, this one included."""
+    """Requests that the server may have had by then, this one included."""
     alone: bool
-    """Nothing else was sent while it was there; what was overtaken, which may be in work for long, does not count."""
+    """Whether nothing else was there with it. Overtaken requests, which may be in work for long, do not count."""
 
 
 class ServerCapacity:
-    """What is known of one server. Request numbers ascend; times are seconds."""
+    """What is known of one server. Request numbers ascend; times are in seconds."""
 
     __slots__ = (
         "_alone",
@@ -103,24 +103,24 @@ class ServerCapacity:
     def __init__(self, first: int = FIRST_LIMIT) -> None:
         self._limit = first
         self._alone = ServiceTimes(ALONE_KEPT)
-        """What a request alone takes, the hop included."""
+        """Time that a request alone takes, the hop included."""
         self.usual_s = 0.0
-        """What one takes as things are, the wait in the server's queue included; 0: not known yet."""
+        """Time that a request usually takes now, the wait in the server's queue included; 0 if not known yet."""
         self._overlap = RequestOverlap()
         self._gain = OverlapGain()
         self._by_times = False
-        """The limit rests on what requests take, as overlaps prove less."""
+        """Whether the limit rests on service times, as overlaps prove less."""
         self._fell_behind = False
         self._calibrating = True
         self._calibrated_s = 0.0
         self._calibrated_before = False
         self._alone_at = 0.0
         self._answers = 0
-        """Since a request was alone for the last time."""
+        """Answers since a request was last alone."""
         self._round = ServiceTimes()
         self._rounds = FIRST_ROUNDS
         self._singles = 0
-        """Answers since the limit is 1."""
+        """Answers since the limit became 1."""
         self._try_after = FIRST_TRY_AFTER
         self._sent: dict[int, _Sent] = {}
         self._only: int | None = None
@@ -128,36 +128,36 @@ class ServerCapacity:
 
     @property
     def limit(self) -> int:
-        """How many requests the server should have at once, the overtaken among them."""
+        """Number of requests that the server should have at once, overtaken ones included."""
         return 1 if self._calibrating else self._gain.at_once or self._limit
 
     @property
     def _most(self) -> int:
-        """How many are of use: besides those that were overtaken, no more go than a queue surely holds."""
+        """Highest useful limit: besides overtaken requests, no more are sent than a queue surely holds."""
         return min(self.overlap - 1 + SAFE_SIZE, MOST_AT_ONCE)
 
     @property
     def overlap(self) -> int:
-        """The most requests that were in work at one moment of late, as answers out of order prove."""
+        """The most requests that were recently in work at once, as proved by answers out of order."""
         return self._overlap.most
 
     @property
     def overtaken(self) -> int:
-        """Requests that are in work although later ones are answered."""
+        """Number of requests in work although later ones are answered."""
         return self._overlap.overtaken
 
     @property
     def proved(self) -> int:
-        """How many it works on at once at least."""
+        """Number of requests that it usefully works on at once, at least."""
         return self._gain.of_use(self.overlap)
 
     def given_up(self, number: int) -> None:
-        """Nobody waits for this request any more."""
+        """Note that this request is no longer awaited."""
         self._sent.pop(number, None)
         self._overlap.given_up(number)
 
     def sent(self, number: int, unseen: int, now: float) -> None:
-        """A request was sent; with it the server has so many that it was not seen to have taken."""
+        """Note that a request was sent; with it the server has `unseen` that it was not seen to have taken."""
         if self._only is not None and self._only in self._sent:
             self._sent[self._only].alone = False
         self._only = number if unseen == 1 else None
@@ -168,7 +168,7 @@ class ServerCapacity:
             del self._sent[next(iter(self._sent))]
 
     def answered(self, number: int, now: float) -> None:
-        """The server answered one of them; what it answers twice counts once."""
+        """Note that the server answered one of them; a second answer does not count."""
         sent = self._sent.pop(number, None)
         if sent is None:
             return
@@ -217,7 +217,7 @@ class ServerCapacity:
             self._fell_behind = True
             wanted = self._wanted(at_once)
             if out <= self._limit - 1:
-                wanted = max(wanted, min(math.ceil(out), self._limit))  # more were never there: little is known
+                wanted = max(wanted, min(math.ceil(out), self._limit))  # never more were there, so little is known
             surer = self._round.count < SURER * self._least_round
             if surer and wanted < min(self._limit, self._wanted(min(self._round.rate * self._alone.mean_s, out))):
                 return
@@ -241,7 +241,7 @@ class ServerCapacity:
             self._calibrate()
 
     def _at_least(self) -> float:
-        """How many requests alone the server surely does the work of at once."""
+        """Return how many requests alone the server surely does the work of at once."""
         either = max(self._alone.variation, self._round.variation)  # a few answers may not show how much they vary
         alone = self._alone.variation if self._alone.count >= LEAST_ALONE else either
         error = math.sqrt(alone / self._alone.count + either / self._round.count)
@@ -249,11 +249,11 @@ class ServerCapacity:
 
     @property
     def _needs_times(self) -> bool:
-        """Whether it makes a difference what a request alone takes."""
+        """Whether the time that a request alone takes matters."""
         return self._by_times or self.proved == 1
 
     def _wanted(self, at_once: float) -> int:
-        """How many to have at a server that does the work of so many requests at once."""
+        """Return how many requests to have at a server that does the work of `at_once` requests."""
         wanted = max(1, math.ceil(at_once - ROUNDING))
         if at_once < self._round.rate * LONG_S:
             wanted += math.ceil(self._round.rate * WAITING_S)

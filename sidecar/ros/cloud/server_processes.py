@@ -1,6 +1,6 @@
-"""The processes of local servers: DDS notices after a lease of 20 s that one was killed, the kernel at once.
+"""Watches the processes of local servers: DDS notices that one was killed after a lease of 20 s, the kernel at once.
 
-A thread of its own waits for their ends; all else belongs to the ROS thread.
+A separate thread waits for their ends; everything else belongs to the ROS thread.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Collection
 
 MAX_WATCHED = 256
-"""Processes watched; each costs a file descriptor. Further ones are asked whether they live when they are silent."""
+"""Processes watched; each costs a file descriptor. Further ones are asked whether they live when they fall silent."""
 MAX_ENDED = 1024
 """Ended processes that DDS may still believe alive; the oldest is forgotten."""
 _CLOSE_TIMEOUT_S = 1.0
@@ -28,15 +28,15 @@ log = logging.getLogger(__name__)
 
 
 class ServerProcesses:
-    """Watches the processes behind endpoints, where they run on this host and can be told for certain."""
+    """Watches the processes behind endpoints, where they run on this host and can be identified for certain."""
 
     def __init__(self, domain: int, participants: Callable[[], Collection[bytes]], wake: Callable[[], None]) -> None:
-        """`participants`: ids of all ROS processes of the domain; `wake` is called, from any thread, at an end."""
+        """Take `participants`, ids of all ROS processes of the domain; `wake` is called, from any thread, at an end."""
         self._domain = domain
         self._participants = participants
         self._wake = wake
         self._pidfds: dict[bytes, int | None] = {}
-        """By process; None where it can not be told which one it is."""
+        """Pidfds by process; None where the process cannot be identified."""
         self._ended: dict[bytes, None] = {}
         self._events: deque[int] = deque()
         self._epoll: select.epoll | None = None
@@ -44,7 +44,7 @@ class ServerProcesses:
         self._thread: threading.Thread | None = None
 
     def watch(self, endpoint: bytes) -> None:
-        """Notice the end of the process behind `endpoint` from now on."""
+        """Watch for the end of the process behind `endpoint` from now on."""
         process = process_of(endpoint)
         if process in self._pidfds or process in self._ended:
             return
@@ -57,30 +57,30 @@ class ServerProcesses:
             self._wait_for(pidfd)
 
     def watches(self, endpoint: bytes) -> bool:
-        """Whether the end of this endpoint's process will be noticed at once."""
+        """Return whether the end of this endpoint's process will be noticed at once."""
         return self._pidfds.get(process_of(endpoint)) is not None
 
     def has_ended(self, endpoint: bytes) -> bool:
-        """True when its process is over, whatever the graph says."""
+        """Return True when the endpoint's process has ended, whatever the graph says."""
         return process_of(endpoint) in self._ended
 
     def wants_processor(self, endpoint: bytes) -> bool:
-        """Whether its process is known, and runs or would if the machine were not busy."""
+        """Return whether the endpoint's process is known, and runs or waits for a processor."""
         pidfd = self._pidfds.get(process_of(endpoint))
         return pidfd is not None and wants_processor(pidfd)
 
     def take_ended(self) -> bool:
-        """Note the processes that ended since the last call; returns whether there are any."""
+        """Note the processes that ended since the last call; return whether there are any."""
         some = False
         while self._events:
             number = self._events.popleft()
             process = next((process for process, pidfd in self._pidfds.items() if pidfd == number), None)
-            # The number may be another one's by now.
+            # The descriptor may belong to another process by now.
             if process is None or not has_ended(number):
                 continue
             self._release(process)
             if self._is_ambiguous(process):
-                self._pidfds[process] = None  # perhaps the end of the other one
+                self._pidfds[process] = None  # perhaps the other process ended
                 continue
             self._ended[process] = None
             if len(self._ended) > MAX_ENDED:
@@ -89,7 +89,7 @@ class ServerProcesses:
         return some
 
     def forget_the_gone(self) -> None:
-        """Forget the processes that the graph shows no more. Ended ones it shows for the rest of their lease."""
+        """Forget the processes that are gone from the graph, which shows ended ones until their lease is over."""
         wanted = {process_of(endpoint) for endpoint in self._participants()}
         for process in [process for process in self._pidfds if process not in wanted]:
             self._release(process)
@@ -97,7 +97,7 @@ class ServerProcesses:
             del self._ended[process]
 
     def close(self) -> None:
-        """Watch nothing any more."""
+        """Stop watching."""
         if self._thread is not None:
             os.eventfd_write(self._stop_fd, 1)
             self._thread.join(_CLOSE_TIMEOUT_S)
@@ -110,7 +110,7 @@ class ServerProcesses:
             self._epoll = None
 
     def _is_ambiguous(self, process: bytes) -> bool:
-        """Whether another process of the domain, in a container perhaps, has the same bits of its process id."""
+        """Return whether another process of the domain, perhaps in a container, has the same bits of its process id."""
         others = {process_of(endpoint) for endpoint in self._participants()} - {process}
         return any(pid_bits(other + bytes(4)) == pid_bits(process + bytes(4)) for other in others)
 

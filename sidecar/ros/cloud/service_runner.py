@@ -1,4 +1,4 @@
-"""Cloud: one local server, with the executions that wait for its answers."""
+"""Runs requests on one local server in the cloud, and keeps the executions that wait for its answers."""
 
 from __future__ import annotations
 
@@ -32,11 +32,11 @@ class Execution:
     deadline_at: float
     expires_at: float
     number: int | None = None
-    """rmw's sequence number, once it is at the server."""
+    """rmw's sequence number, once the request is at the server."""
 
 
 class ServiceRunner:
-    """Sends requests to one local server and hands its answers, as bytes, to `on_answer`."""
+    """Sends requests to one local server and passes its answers, as bytes, to `on_answer`."""
 
     def __init__(
         self,
@@ -49,7 +49,7 @@ class ServiceRunner:
         alive_since: Callable[[ServiceRunner, float], bool],
         name_of: NameOf,
     ) -> None:
-        """`alive_since`: whether the server has shown a sign of life since then, other than an answer."""
+        """Take `alive_since`: whether the server has shown a sign of life, other than an answer, since then."""
         self.name = name
         self.type = service_type
         self._on_answer = on_answer
@@ -57,11 +57,11 @@ class ServiceRunner:
         self._on_unsent = on_unsent
         self._alive_since = partial(alive_since, self)
         self._at_server: dict[int, Execution] = {}
-        """By rmw's sequence number."""
+        """Executions at the server by rmw's sequence number."""
         self.window: RequestWindow[Execution] = RequestWindow(alive_since=self._alive_since)
         self._server = LocalServer(node, name, service_type, name_of)
         self._heard_at = 0.0
-        """When the server answered last, or got something to do while it had nothing."""
+        """When the server answered last, or got a request while it had none."""
 
     @property
     def handle(self) -> Any:
@@ -70,21 +70,21 @@ class ServiceRunner:
 
     @property
     def pending(self) -> int:
-        """Executions at the server or waiting for it."""
+        """Number of executions at the server or waiting for it."""
         return len(self._at_server) + self.window.waiting
 
     @property
     def server(self) -> LocalServer:
-        """Whom it asks."""
+        """The server that runs the requests."""
         return self._server
 
     @property
     def silent_since(self) -> float | None:
-        """Since when the server has something to answer and answers nothing, or None."""
+        """Start of the server's silence while it has something to answer, or None."""
         return self._heard_at if self._at_server else None
 
     def add(self, execution: Execution, now: float) -> bool:
-        """Send `execution` now, or as soon as the server has room; return False when it has to wait."""
+        """Send `execution` now or as soon as the server has room; return False when it has to wait."""
         window = self.window
         window.add(
             execution, execution.priority, execution.deadline_at, execution.expires_at, now, robot=execution.robot
@@ -93,7 +93,7 @@ class ServiceRunner:
         return not window.holds(execution)
 
     def release(self, now: float) -> None:
-        """Send what may be sent now."""
+        """Send the executions that may go now."""
         for execution in self.window.release(now):
             request, execution.request = execution.request, None  # it may be a large image, and is not needed again
             if request is None or execution.expires_at <= now:
@@ -123,7 +123,7 @@ class ServiceRunner:
         self.release(now)
 
     def abandon(self, execution: Execution) -> None:
-        """Forget `execution`; an answer to it is stray from now on."""
+        """Forget `execution`; an answer to it will be stray."""
         if execution.number is not None:
             self._at_server.pop(execution.number, None)
             self.window.given_up(execution.number)
@@ -139,7 +139,7 @@ class ServiceRunner:
         return sent, unsent
 
     def take_back_unsent(self) -> list[Execution]:
-        """Forget what waits, which certainly has not run; what is at the server may still be answered."""
+        """Forget and return the waiting executions, which certainly have not run; those at the server stay."""
         return self.window.take_all()
 
     def close(self) -> None:

@@ -1,9 +1,9 @@
-"""Cloud: requests of several robots that wait for one local server, so that none of them can keep it from the others.
+"""Shares one local server in the cloud among robots, so that none can keep it from the others.
 
-Three turns of four follow priority and deadline, whoever asks (`request_queue.py`). Every fourth one is a robot's own:
-the robots that have something in time take these in turns, each with what is most urgent to itself. So a robot that
-asks faster than the server answers, and calls all of it urgent, leaves the others their share of a quarter of the
-server's time; a robot alone notices nothing.
+Three turns of four follow priority and deadline, regardless of the robot (`request_queue.py`). Every fourth turn
+belongs to one robot: the robots with requests in time take these by turns, each with its own most urgent request. So a
+robot that sends faster than the server answers, all of it marked urgent, leaves the others their share of a quarter of
+the server's time. A single robot notices nothing.
 """
 
 from __future__ import annotations
@@ -19,20 +19,20 @@ if TYPE_CHECKING:
     from sidecar.core.base.values import Priority
 
 SHARED_ONE_IN = 4
-"""Every so many turns one goes by robots."""
+"""One turn in this many goes by robots."""
 
 T = TypeVar("T", bound="Hashable")
 
 
 class SharedQueue(Generic[T]):
-    """As RequestQueue, of requests that belong to robots."""
+    """Like RequestQueue, for requests that belong to robots."""
 
     __slots__ = ("_all", "_of", "_owner", "_turn")
 
     def __init__(self) -> None:
         self._all: RequestQueue[T] = RequestQueue()
         self._of: OrderedDict[Hashable, RequestQueue[T]] = OrderedDict()
-        """By robot, the one whose turn comes next first; only those of which something waits."""
+        """Queues by robot, in the order of their turns; only robots with waiting requests."""
         self._owner: dict[T, Hashable] = {}
         self._turn = 0
 
@@ -43,7 +43,7 @@ class SharedQueue(Generic[T]):
         return request in self._all
 
     def add(self, request: T, robot: Hashable, priority: Priority, deadline: float, expires: float) -> None:
-        """Let a robot's request wait, until `remove` at the latest."""
+        """Queue a robot's request, until `remove` at the latest."""
         self._all.add(request, priority, deadline, expires)
         own = self._of.get(robot)
         if own is None:
@@ -52,12 +52,12 @@ class SharedQueue(Generic[T]):
         self._owner[request] = robot
 
     def remove(self, request: T) -> None:
-        """It is not wanted any more."""
+        """Remove a request that is no longer wanted."""
         self._all.remove(request)
         self._disown(request)
 
     def take(self, now: float, hopeless_by: float, *, late_too: bool) -> tuple[T, bool] | None:
-        """Return the request whose turn it is and whether it is late, as `RequestQueue.take`."""
+        """Return the request whose turn it is and whether it is late, like `RequestQueue.take`."""
         if len(self._of) > 1:
             self._turn = (self._turn + 1) % SHARED_ONE_IN
             if not self._turn and (found := self._take_of_next(now, hopeless_by)) is not None:
@@ -86,7 +86,7 @@ class SharedQueue(Generic[T]):
             del self._of[robot]
 
     def take_all(self) -> list[T]:
-        """Return all of them, in order of arrival, and let none wait any more."""
+        """Remove and return all requests, in order of arrival."""
         self._of.clear()
         self._owner.clear()
         return self._all.take_all()

@@ -1,1 +1,1 @@
-"""Who is in the local ROS graph, and what its types are."""
+"""Finds out who is in the local ROS graph, and of which types."""

@@ -1,8 +1,8 @@
-"""Reading what the ROS processes of the domain say of their nodes (rmw's discovery topic).
+"""Reads what the ROS processes of the domain announce about their nodes (rmw's discovery topic).
 
-Each process keeps what it said last for those that come later (`transient_local`). So a new reader of that topic makes
-each process that lives send it again: DDS's own threads do so, within tens of milliseconds, also while the application
-is busy. A process that was killed, or stands still, sends nothing.
+Each process keeps its last announcement for later readers (`transient_local`). So a new reader of that topic makes
+each live process send it again. DDS's own threads do so within tens of milliseconds, even while the application is
+busy. A process that was killed or is stopped sends nothing.
 """
 
 from __future__ import annotations
@@ -19,10 +19,10 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
 
 MAX_HEARD = 1024
-"""Participants that one call hears; the topic's depth."""
+"""Participants that one call can hear; the depth of the topic."""
 TAKEN_AT_ONCE = 64
 BYTES_AT_ONCE = 1 << 16
-"""Some milliseconds, if it is many small nodes; the last message taken may be beyond that."""
+"""Some milliseconds of many small nodes; the last message taken may exceed it."""
 
 log = logging.getLogger(__name__)
 
@@ -43,12 +43,12 @@ class DiscoveryTopic:
         return self._topic is not None
 
     def open(self) -> bool:
-        """Call all processes; False if it can not be."""
+        """Call all processes; return False if that is impossible."""
         if not self.usable:
             return False
         try:
             if self._type is None:
-                # Without it no rmw of DDS works, but that of another kind does.
+                # Every DDS rmw needs this package; other rmw implementations work without it.
                 module = importlib.import_module("rmw_dds_common.msg")
                 self._type = MessageType(module.ParticipantEntitiesInfo)
             self._topic = LatchedTopic(self._node.handle.pointer, PARTICIPANTS_TOPIC, self._type, MAX_HEARD)
@@ -61,7 +61,7 @@ class DiscoveryTopic:
         return True
 
     def take(self) -> Iterator[bytes]:
-        """Yield the answers that have arrived, some of many."""
+        """Yield the answers that have arrived, a limited number at a time."""
         taken_bytes = 0
         for _ in range(TAKEN_AT_ONCE):
             info = None if self._topic is None or taken_bytes >= BYTES_AT_ONCE else self._topic.take()

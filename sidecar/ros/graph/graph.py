@@ -1,7 +1,7 @@
-"""Who serves what in the local ROS graph.
+"""Finds out who serves what in the local ROS graph.
 
-rmw says that the graph has changed, not what of it; `looks.py` says when it is looked at. An endpoint whose node rmw
-does not know may have a name all the same (`unknown_nodes.py`); without one it is no application's server.
+rmw reports that the graph has changed, but not what; `looks.py` decides when to look. An endpoint whose node rmw does
+not know may have a name all the same (`unknown_nodes.py`); without one it does not count as an application's server.
 """
 
 from __future__ import annotations
@@ -18,12 +18,12 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Generator, Mapping
 
     NameOf = Callable[[bytes, float], str | None]
-    """Of an endpoint that rmw has no name for: its node's full name now, if that is known."""
+    """Takes an endpoint that rmw has no name for, and the time; returns its node's full name, if known."""
 
 SIDECAR_NODE_PREFIX = "_plr_sidecar_"
 """The leading underscore hides the node from `ros2 node list`."""
 PARTICIPANTS_TOPIC = "ros_discovery_info"
-"""DDS's name of the topic by which each ROS process tells of its nodes (rmw_dds_common)."""
+"""DDS name of the topic on which each ROS process announces its nodes (rmw_dds_common)."""
 _UNKNOWN_NODE = "_NODE_NAME_UNKNOWN_"
 
 
@@ -33,13 +33,13 @@ def sidecar_node_name(sidecar: str) -> str:
 
 
 def is_sidecar(full_node_name: str) -> bool:
-    """True for nodes of FogROS2-PLR sidecars."""
+    """Return True for nodes of FogROS2-PLR sidecars."""
     return full_node_name.rsplit("/", 1)[-1].startswith(SIDECAR_NODE_PREFIX)
 
 
 @dataclass(frozen=True, slots=True)
 class Served:
-    """One service name: its types, and for each the full names of the nodes that serve it."""
+    """The types of one service name, each with the full names of the nodes that serve it."""
 
     by_type: Mapping[str, frozenset[str]]
 
@@ -56,11 +56,11 @@ class Served:
 def scan(
     node: Any, name_of: NameOf, wanted: Callable[[ServiceName], bool], now: float
 ) -> Generator[None, None, dict[ServiceName, Served]]:
-    """Return the services of the graph whose node is known, node after node, and all those that are `wanted`."""
+    """Return the services of known nodes, scanning node by node, and all servers found for those that are `wanted`."""
     found: dict[ServiceName, dict[str, set[str]]] = {}
     for name, namespace in frozenset(node.get_node_names_and_namespaces()):
         if name == _UNKNOWN_NODE:
-            continue  # its endpoints are discovered before its name, which is a change of its own
+            continue  # its endpoints are discovered before its name, which changes the graph again
         full_name = _full_name(namespace, name)
         try:
             services = node.get_service_names_and_types_by_node(name, namespace)
@@ -71,8 +71,8 @@ def scan(
             for kind in types:
                 by_type.setdefault(kind, set()).add(full_name)
         yield
-    # Of several nodes of one name, as of a server that was started twice, rmw shows the services of one only; and none
-    # of a process whose nodes it does not know, perhaps beside a sidecar.
+    # Of several nodes of one name, such as a server started twice, rmw shows the services of one only. It shows none of
+    # a process whose nodes it does not know, even if a sidecar serves the name as well.
     for service in [ServiceName(name) for name, _ in node.get_service_names_and_types()]:
         if not wanted(service) or any(not is_sidecar(n) for nodes in found.get(service, {}).values() for n in nodes):
             continue
@@ -89,9 +89,9 @@ def scan(
 
 
 def server_endpoints(node: Any, service: ServiceName, name_of: NameOf, now: float) -> dict[str, dict[bytes, bool]]:
-    """Return type -> DDS ids of the endpoints that answer for `service`, and whether each is known as an application's.
+    """Return type -> DDS ids of the endpoints that answer for `service`, each with whether an application owns it.
 
-    Nothing where rmw is not DDS.
+    The result is empty where rmw is not DDS.
     """
     found: dict[str, dict[bytes, bool]] = {}
     for info in _reply_writers(node, service):
@@ -112,7 +112,7 @@ def _full_name(namespace: str, name: str) -> str:
 
 
 def _reply_writers(node: Any, service: str) -> list[dict[str, Any]]:
-    # Not through the node's own method, which makes an object of each endpoint's QoS: it takes twice as long.
+    # The node's own method makes an object of each endpoint's QoS and takes twice as long.
     infos: list[dict[str, Any]] = _rclpy.rclpy_get_publishers_info_by_topic(node.handle, f"rr{service}Reply", True)
     return infos
 
@@ -123,6 +123,6 @@ def _service_type(dds_type: str) -> str:
 
 
 def participants(node: Any) -> frozenset[bytes]:
-    """Return the DDS ids of the endpoints by which each ROS process of the domain tells of its nodes: one for each."""
+    """Return the DDS ids of the endpoints on which the domain's ROS processes announce their nodes, one per process."""
     infos = _rclpy.rclpy_get_publishers_info_by_topic(node.handle, PARTICIPANTS_TOPIC, True)
     return frozenset(bytes(info["endpoint_gid"]) for info in infos)

@@ -1,6 +1,6 @@
-"""Before the start: whether the types of configured services are installed here, as far as they are known.
+"""Checks before the start whether the types of configured services, as far as known, are installed here.
 
-A configuration names services, not types. What servers offered when the sidecar last ran stands in its `state_dir`.
+A configuration names services, not types. The sidecar's `state_dir` holds what servers offered when it last ran.
 """
 
 from __future__ import annotations
@@ -21,8 +21,10 @@ MAX_LINES = 10
 
 
 def missing_types(peers: Iterable[Peer], rules: Iterable[ServiceRule]) -> list[str]:
-    """Return a line for each service that `peers` offer, `rules` carry, and whose type is not here; at most MAX_LINES
-    and one that counts the rest."""
+    """Return a line for each service that `peers` offer and `rules` carry, but whose type is missing here.
+
+    There are at most MAX_LINES, and one that counts the rest.
+    """
     carried = Rules(rules)
     servers = {
         (offer.name, offer.type): peer.name

@@ -1,7 +1,7 @@
-"""When the local ROS graph is looked at, and how much of a look is done in one go.
+"""Decides when to look at the local ROS graph, and how much of a look to do in one go.
 
 The ROS thread carries requests as well, and a look at some hundred services takes tens of milliseconds. So a look is a
-generator of small steps, of which a few are done between two waits.
+generator of small steps, and a few of them run between two waits.
 """
 
 from __future__ import annotations
@@ -13,19 +13,19 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
 TURN_S = 0.002
-"""Of the ROS thread in one go; what a request may have to wait for, together with the longest step."""
+"""Time on the ROS thread in one go; with the longest step, this is how long a request may have to wait."""
 REST = 9.0
-"""A look that took so long is followed by a rest of this many times as long: graphs that change all the time, as while
-a large system starts, cost a tenth of the ROS thread."""
+"""Rest after a look, as a multiple of its duration: a graph that changes all the time, as while a large system starts,
+costs a tenth of the ROS thread."""
 FIRST_SETTLING_S = 0.02
-"""After a change, while an entity of ours waits to be matched or for its time: the pause until the next look, which is
-doubled from look to look."""
+"""First pause between looks after a change, while one of our entities waits to be matched or for its time; it doubles
+with each look."""
 IDLE_PERIOD_S = 5.0
-"""Without any change: against one that was not told of, and for what has a time of its own."""
+"""Pause without any change: finds unreported changes, and serves work that has its own timing."""
 
 
 class Looks:
-    """One look after the other. `begin` returns a look's steps, `settling` whether another one should follow soon."""
+    """Runs one look after the other. `begin` returns a look's steps; `settling`, whether another should follow soon."""
 
     def __init__(
         self,
@@ -34,7 +34,7 @@ class Looks:
         now: float,
         clock: Callable[[], float] = time.thread_time,
     ) -> None:
-        """`clock`: what the thread has worked, so that looks are not rarer because others keep the machine busy."""
+        """Take as `clock` the thread's CPU time, so that a busy machine does not make looks rarer."""
         self._begin = begin
         self._settling = settling
         self._clock = clock
@@ -46,7 +46,7 @@ class Looks:
         self._changed = False
 
     def changed(self, now: float) -> None:
-        """The graph, or what is wanted of it, is another one."""
+        """Note that the graph, or what is wanted of it, has changed."""
         self._pause_s = FIRST_SETTLING_S
         if self._steps is not None:
             self._changed = True
@@ -54,11 +54,11 @@ class Looks:
             self._due_at = min(self._due_at, max(now, self._rested_at))
 
     def next_due(self) -> float:
-        """Return when `turn` has something to do; a time that is over while a look is under way."""
+        """Return when `turn` has something to do; a time in the past while a look is under way."""
         return float("-inf") if self._steps is not None else self._due_at
 
     def turn(self, now: float) -> None:
-        """Look on for about TURN_S, if it is time. What a step raises ends that look, not the next one."""
+        """Continue the look for about TURN_S, or begin one if it is due. An exception ends that look, not the next."""
         if self._steps is None:
             if now < self._due_at:
                 return

@@ -1,4 +1,4 @@
-"""The names of nodes that rmw does not know, asked for at their own processes."""
+"""Asks the processes of nodes that rmw does not know for the names of these nodes."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from sidecar.ros.stats import BridgeStats
 
 CALL_S = 0.7
-"""How long a call waits for those that it is about."""
+"""How long a call waits for the participants it asks."""
 POLL_S = 0.02
 NAMES_LOGGED = 8
 
@@ -23,7 +23,7 @@ log = logging.getLogger(__name__)
 
 
 class NodeNames:
-    """One call at a time. All methods belong to the ROS thread."""
+    """Makes one call at a time. All methods belong to the ROS thread."""
 
     def __init__(self, node: Any, stats: BridgeStats, limited_log: LimitedLog) -> None:
         self._unknown = UnknownNodes()
@@ -31,22 +31,22 @@ class NodeNames:
         self._stats = stats
         self._limited = limited_log
         self._asked: set[bytes] = set()
-        """Participants of the present call that have not answered."""
+        """Participants of the current call that have not answered."""
         self._learned: set[str] = set()
-        """Names that became known by it."""
+        """Names that the current call found."""
         self._hears_at = 0.0
         self._ends_at = 0.0
 
     def begin_look(self) -> None:
-        """Another look at the graph begins."""
+        """Begin another look at the graph."""
         self._unknown.begin_look()
 
     def name_of(self, endpoint: bytes, now: float) -> str | None:
-        """Return the full name of its node, or None, and it is asked for soon; for each that rmw has no name for."""
+        """Return the full name of the node of an endpoint that rmw has no name for; if None, it is asked for soon."""
         return self._unknown.name_of(endpoint, now)
 
     def end_look(self) -> None:
-        """Forget the endpoints that the look did not meet."""
+        """Forget the endpoints that the look did not see."""
         if dropped := self._unknown.end_look():
             self._stats.dropped["too_many_unknown_nodes"] += dropped
 
@@ -55,7 +55,7 @@ class NodeNames:
         return self._hears_at if self._topic.is_open else self._unknown.next_due()
 
     def turn(self, now: float) -> bool:
-        """Ask, if it is time, or hear who answers; True when a name became known."""
+        """Start a call if it is due, or hear its answers; return True when a name became known."""
         due = self.next_due()
         if due is None or now < due:
             return False
@@ -72,7 +72,7 @@ class NodeNames:
         return learned
 
     def close(self) -> None:
-        """Ask nobody any more."""
+        """End the current call, if any."""
         self._topic.close()
 
     def _hear(self, now: float) -> bool:

@@ -1,4 +1,4 @@
-"""Reads what a ROS process says of its nodes: rmw_dds_common/msg/ParticipantEntitiesInfo, as bytes in CDR.
+"""Parses what a ROS process announces about its nodes: rmw_dds_common/msg/ParticipantEntitiesInfo, as bytes in CDR.
 
     encapsulation       4 bytes
     gid                 16 bytes, of the participant
@@ -6,8 +6,8 @@
         namespace, name     strings: length with the NUL, characters
         readers, writers    length and 16 bytes for each endpoint
 
-Lengths are 32 bits, aligned to 4 bytes. Any process of the ROS domain can send this: nothing is believed that the bytes
-do not bear out, and a message has no more than MAX_INFO_BYTES and MAX_NODES.
+Lengths are 32 bits, aligned to 4 bytes. Any process of the ROS domain can send this. So every length is checked against
+the bytes, and a message may have at most MAX_INFO_BYTES and MAX_NODES.
 """
 
 from __future__ import annotations
@@ -23,24 +23,24 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
 
 MAX_INFO_BYTES = 1 << 18
-"""A process with a hundred nodes of 20 endpoints each says 35 kB. So many bytes are read in some milliseconds."""
+"""A process with a hundred nodes of 20 endpoints each sends 35 kB. This limit takes some milliseconds to parse."""
 MAX_NODES = 512
-"""Of one process."""
+"""Maximum number of nodes of one process."""
 _ENCAPSULATION_BYTES = 4
 _LITTLE_ENDIAN, _BIG_ENDIAN = b"\0\1", b"\0\0"
 _NAMESPACE = re.compile(rb"/|(?:/[A-Za-z0-9_]+)+")
 _NAME = re.compile(rb"[A-Za-z0-9_]+")
 _MAX_NAME_BYTES = 256
-"""With the NUL: the message's own limit."""
+"""Including the NUL; the limit in the message's definition."""
 
 
 def speaker(info: bytes) -> bytes:
-    """Return the id of the participant that the message is about; shorter if it is cut off."""
+    """Return the id of the participant that the message is about; shorter if the message is cut off."""
     return info[_ENCAPSULATION_BYTES : _ENCAPSULATION_BYTES + PARTICIPANT_BYTES]
 
 
 def nodes_of(info: bytes) -> Iterator[tuple[str, frozenset[bytes]]]:
-    """Yield each node's full name and the DDS ids of its writers, among which are those of its services' answers.
+    """Yield each node's full name and the DDS ids of its writers, which include those of its services' answers.
 
     Raises RosBridgeError where the bytes are no such message, perhaps after the first nodes.
     """
@@ -62,7 +62,7 @@ def nodes_of(info: bytes) -> Iterator[tuple[str, frozenset[bytes]]]:
 
 
 class _Reader:
-    """Goes over the bytes, from behind the participant's id. All methods raise RosBridgeError."""
+    """Parses the bytes after the participant's id. All methods raise RosBridgeError."""
 
     def __init__(self, info: bytes) -> None:
         representation = info[:2]

@@ -1,11 +1,11 @@
-"""Endpoints whose node rmw does not know, and what their processes say of them when they are asked.
+"""Tracks endpoints whose node rmw does not know, and what their processes answer when asked.
 
-DDS gives up a process that stands still for longer than its lease, and takes it back when it goes on: a paused virtual
-machine, a debugger, a starved host. What the process said of its nodes it is not given a second time then (Fast DDS
-believes it delivered): rmw shows its endpoints as those of an unknown node until the process says something new. The
-same befalls all others in the eyes of a process that stood still itself.
+DDS drops a process that stops for longer than its lease, and takes it back when it resumes: in a paused virtual
+machine, under a debugger, on a starved host. But what the process announced about its nodes is not delivered again
+(Fast DDS believes it was). So rmw shows its endpoints as those of an unknown node until the process announces something
+new. A process that was stopped itself sees all others like this.
 
-An endpoint is of an unknown node for some milliseconds as well whenever a process starts; so a while is waited first.
+When a process starts, its endpoints also belong to an unknown node for some milliseconds; so nothing is asked at once.
 """
 
 from __future__ import annotations
@@ -16,15 +16,15 @@ from sidecar.ros.cloud.dds_id import participant_of
 from sidecar.ros.graph.participant_info import nodes_of, speaker
 
 UNKNOWN_FOR_S = 1.0
-"""A process is asked when rmw has not known the node of one of its endpoints for so long; it is also the least time
-between two calls, of which each one reaches all processes of the domain."""
+"""How long rmw must not have known the node of an endpoint before its process is asked. Also the least time between two
+calls, as each call reaches all processes of the domain."""
 MAX_PAUSE_S = 60.0
-"""From one call to the next for an endpoint that nobody names, as of a program that is not ROS; doubled up to this."""
+"""Longest pause between calls for an endpoint that nobody names, such as a non-ROS program's; it doubles up to this."""
 MAX_PARTICIPANTS = 128
-"""Participants with endpoints of unknown nodes. A domain has 120 on one host: all of them, if it was ours that stood
-still."""
+"""Participants with endpoints of unknown nodes. A domain has up to 120 on one host, and all of them are unknown if it
+was our process that stopped."""
 MAX_ENDPOINTS = 512
-"""Of each."""
+"""Endpoints of each participant."""
 
 
 @dataclass(slots=True)
@@ -32,13 +32,13 @@ class _Participant:
     due_at: float
     pause_s: float = UNKNOWN_FOR_S
     names: dict[bytes, str | None] = field(default_factory=dict)
-    """By endpoint; None until it is told."""
+    """Node names by endpoint; None until known."""
     seen: set[bytes] = field(default_factory=set)
-    """Of the endpoints, those that the present look met."""
+    """Endpoints that the current look saw."""
 
 
 class UnknownNodes:
-    """Looks at the graph begin and end; in between `name_of` is asked for each endpoint that rmw has no name for."""
+    """Endpoints without a name. In each look at the graph, `name_of` is called for each that rmw has no name for."""
 
     def __init__(self) -> None:
         self._participants: dict[bytes, _Participant] = {}
@@ -47,13 +47,13 @@ class UnknownNodes:
         self._dropped = 0
 
     def begin_look(self) -> None:
-        """Another look at the graph begins."""
+        """Begin another look at the graph."""
         self._dropped = 0
         for participant in self._participants.values():
             participant.seen.clear()
 
     def name_of(self, endpoint: bytes, now: float) -> str | None:
-        """Return the full name of its node, if it is told by now; note it otherwise, so that it is asked for."""
+        """Return the full name of the endpoint's node, if known by now; otherwise note the endpoint to be asked for."""
         participant = self._participants.get(participant_of(endpoint))
         if participant is None:
             if len(self._participants) >= MAX_PARTICIPANTS:
@@ -70,9 +70,9 @@ class UnknownNodes:
         return participant.names[endpoint]
 
     def end_look(self) -> int:
-        """Forget the endpoints that the look did not meet: they are gone, or rmw knows them.
+        """Forget the endpoints that the look did not see: they are gone, or rmw knows them.
 
-        Return how many it met that there was no room for.
+        Return how many it saw that there was no room for.
         """
         for key, participant in tuple(self._participants.items()):
             participant.names = {endpoint: participant.names[endpoint] for endpoint in participant.seen}
@@ -86,9 +86,9 @@ class UnknownNodes:
         return self._due_at
 
     def take_due(self, now: float) -> frozenset[bytes]:
-        """Return the ids of the participants to be asked now, if it is time for any: a call reaches all.
+        """Return the ids of the participants to ask now: if any is due, all, as a call reaches all.
 
-        The next time is later for each of them.
+        The next call is scheduled later for each of them.
         """
         if self._due_at is None or now < self._due_at:
             return frozenset()
@@ -101,9 +101,9 @@ class UnknownNodes:
         return frozenset(asked)
 
     def learn(self, info: bytes) -> frozenset[str]:
-        """Take in what a process says of its nodes; return the names that became known by it.
+        """Take in what a process announces about its nodes; return the names that became known.
 
-        Raises RosBridgeError: it is no such message.
+        Raises RosBridgeError if it is no such message.
         """
         participant = self._participants.get(speaker(info))
         if participant is None:

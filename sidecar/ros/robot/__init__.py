@@ -1,1 +1,1 @@
-"""The robot's end: services offered in place of their servers, and fallbacks."""
+"""Runs the robot's end: services offered in place of their servers, and fallbacks."""

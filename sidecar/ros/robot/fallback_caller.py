@@ -1,6 +1,6 @@
-"""Robot: the local services that stand in for the network: where they are, and what they are asked.
+"""Finds and calls the local services of a robot that stand in for the network.
 
-When they are asked, and which answer counts, is settled in `sidecar.core.robot.fallback.fallbacks`.
+`sidecar.core.robot.fallback.fallbacks` decides when they are called, and which answer counts.
 """
 
 from __future__ import annotations
@@ -29,14 +29,14 @@ if TYPE_CHECKING:
     from sidecar.ros.stats import BridgeStats
 
 MAX_ASKED = 64
-"""Requests whose number at one fallback is remembered; the oldest is forgotten: it was lost long ago."""
+"""Requests whose number at one fallback is remembered; beyond this the oldest, lost long ago, is forgotten."""
 COMPLAIN_AFTER_S = 5.0
-"""For so long a fallback may be missing without a word: the robot's nodes start together."""
+"""How long a fallback may be missing before that is logged: the robot's nodes start together."""
 KEPT_FOR_S = 15.0
-"""A service is offered for so long although its fallback went away and no server is there: a node that crashed is
-started again within seconds, and what applications asked meanwhile is waiting."""
+"""How long a service is still offered without its fallback and any server: a node that crashed is restarted within
+seconds, and the requests made meanwhile wait for it."""
 TYPE_RETRY_S = 30.0
-"""How often a type that is not installed is looked for again."""
+"""How often a type that is not installed is tried again."""
 
 log = logging.getLogger(__name__)
 
@@ -52,7 +52,7 @@ class FallbackAnswer:
 
 
 class _Fallback:
-    """One fallback that is there."""
+    """A fallback found in the local graph."""
 
     def __init__(
         self, server: LocalServer, on_answer: Callable[[RequestId, bytes, float], None], on_stray: Callable[[], None]
@@ -61,7 +61,7 @@ class _Fallback:
         self._on_answer = on_answer
         self._on_stray = on_stray
         self._asked: dict[int, RequestId] = {}
-        """By rmw's sequence number."""
+        """Requests by rmw's sequence number."""
 
     @property
     def handle(self) -> Any:
@@ -87,7 +87,7 @@ class _Fallback:
 
 @dataclass(slots=True)
 class _Complaint:
-    """Why a fallback can not be asked."""
+    """Why a fallback cannot be called."""
 
     text: str
     since: float
@@ -95,7 +95,7 @@ class _Complaint:
 
 
 class FallbackCaller:
-    """Finds the fallbacks in the local graph and asks them. All methods belong to the ROS thread."""
+    """Finds the fallbacks in the local graph and calls them. All methods belong to the ROS thread."""
 
     def __init__(
         self,
@@ -109,7 +109,7 @@ class FallbackCaller:
         on_answer: Callable[[FallbackAnswer, float], None],
         on_failure: Callable[[RequestFailed, float], None],
     ) -> None:
-        """`on_answer` gives an answer to the application, `on_failure` ends a request that gets none."""
+        """Call `on_answer` to answer the application, and `on_failure` to end a request that gets no answer."""
         self._loop = loop
         self._processes = processes
         self._name_of = name_of
@@ -121,10 +121,10 @@ class FallbackCaller:
         self._fallbacks: dict[ServiceName, _Fallback] = {}
         self._up: frozenset[ServiceName] = frozenset()
         self._types: dict[ServiceName, tuple[str, float]] = {}
-        """Of those that can be asked, or could a moment ago, their types and when that was seen last."""
+        """Types of the fallbacks that can be called, or could lately, and when that was last seen."""
         self._complaints: dict[ServiceName, _Complaint] = {}
         self._refused: dict[ServiceName, str] = {}
-        """Fallbacks whose type can not be used here, and that type."""
+        """Services whose fallback's type cannot be used here, with that type."""
         self._types_retried_at = 0.0
         self._publish_state()
 
@@ -135,54 +135,54 @@ class FallbackCaller:
 
     @property
     def wanted(self) -> frozenset[ServiceName]:
-        """The services that have a fallback, and those that are one."""
+        """The services that have a fallback, and those that serve as one."""
         return frozenset(self._policy.services) | frozenset(self._policy.services.values())
 
     @property
     def settling(self) -> bool:
-        """Whether a fallback that is there can not be asked yet."""
+        """Whether a fallback that was found cannot be called yet."""
         return len(self._up) < len(self._fallbacks)
 
     def strike_out(self, now: float) -> None:
-        """Some process ended: perhaps a fallback's."""
+        """Strike out the servers of processes that ended; a fallback's may be among them."""
         for service, fallback in self._fallbacks.items():
             if fallback.server.strike_out(self._processes.has_ended):
                 self._replaced(service, now)
         self._note_up(now)
 
     def types(self) -> dict[ServiceName, str]:
-        """The services whose fallback can be asked, or is likely to come back, with their types."""
+        """Return the services whose fallback can be called, or is likely to come back, with their types."""
         return {service: kind for service, (kind, _) in self._types.items()}
 
     # -- what becomes of requests ----------------------------------------------------------------------------------
 
     def submitted(self, request_id: RequestId, service: ServiceName, payload: bytes, now: float) -> None:
-        """A request goes to the network."""
+        """Note that a request goes to the network."""
         self._policy.submitted(request_id, service, payload, now)
         self._act(now)
 
     def unreachable(self, request_id: RequestId, now: float) -> None:
-        """No path to any server is up."""
+        """Note that no path to any server is up."""
         self._policy.unreachable(request_id, now)
         self._act(now)
 
     def deadline_missed(self, request_id: RequestId, now: float) -> bool:
-        """The network missed the deadline; returns whether the application has no answer yet."""
+        """Note that the network missed the deadline; return whether the application has no answer yet."""
         unanswered = self._policy.deadline_missed(request_id, now)
         self._act(now)
         return unanswered
 
     def has_answered(self, request_id: RequestId) -> bool:
-        """Whether the application has its answer from a fallback."""
+        """Return whether the application has its answer from a fallback."""
         return self._policy.has_answered(request_id)
 
     def network_answered(self, request_id: RequestId, now: float) -> None:
-        """The network's answer has arrived."""
+        """Note that the network's answer has arrived."""
         self._policy.network_answered(request_id, now)
         self._act(now)
 
     def network_failed(self, failure: RequestFailed, now: float) -> bool:
-        """The network gives no answer; returns whether nobody else may."""
+        """Note that the network gives no answer; return whether no fallback can give one either."""
         hopeless = self._policy.network_failed(failure, now)
         self._act(now)
         return hopeless
@@ -214,7 +214,7 @@ class FallbackCaller:
     # -- what the graph shows --------------------------------------------------------------------------------------
 
     def look(self, served: Mapping[ServiceName, Served], offers: Mapping[ServiceName, str], now: float) -> None:
-        """Follow the fallbacks; `offers`: services of the network and their types, which the fallbacks must have."""
+        """Track the fallbacks in the graph; they must have the types in `offers`, the services of the network."""
         retry_types = now - self._types_retried_at >= TYPE_RETRY_S
         if retry_types:
             self._types_retried_at = now
@@ -301,7 +301,7 @@ class FallbackCaller:
             log.error("service %s has no fallback: %s", service, text)
 
     def _stray(self) -> None:
-        """An answer to what was given up as lost, or a second answer because two nodes serve one name."""
+        """Count an answer to a request given up as lost, or a second answer because two nodes serve one name."""
         self._stats.dropped["answer_without_execution"] += 1
 
     def _publish_state(self) -> None:
@@ -313,16 +313,16 @@ class FallbackCaller:
     # -- time ------------------------------------------------------------------------------------------------------
 
     def next_due(self) -> float | None:
-        """When `on_timer` has something to do, or None."""
+        """Return when `on_timer` has something to do, or None."""
         return self._policy.next_timer()
 
     def on_timer(self, now: float) -> None:
-        """Ask what has to begin."""
+        """Make the calls that are due."""
         self._policy.handle_timer(now)
         self._act(now)
 
     def close(self) -> None:
-        """Ask nobody any more."""
+        """Close all fallbacks."""
         self._loop.set_clients(())
         for fallback in self._fallbacks.values():
             fallback.server.close()

@@ -1,8 +1,8 @@
-"""Answers to clients that DDS has only half discovered.
+"""Keeps answers to clients that DDS has only half discovered.
 
-A client's request may arrive before this side knows where its answers go: its writer is matched, its reader is not yet.
-rmw waits 0.1 s for that, on the calling thread, and then gives up. On a busy computer discovery takes longer: such an
-answer is kept, later ones to the same client stand behind it, and it is tried again until the client is known.
+A client's request may arrive before this side knows where its answers go: its writer is matched, but its reader is not.
+rmw waits 0.1 s for that on the calling thread, then gives up. On a busy computer discovery takes longer. So the answer
+is kept, later ones to the same client queue behind it, and it is tried again until the client is known.
 """
 
 from __future__ import annotations
@@ -13,13 +13,13 @@ from typing import Generic, TypeVar
 
 FIRST_RETRY_S = 0.1
 MAX_RETRY_S = 1.0
-"""Tries of one client are so far apart, doubling from the first to this ..."""
+"""Longest interval between tries of one client, doubling from the first ..."""
 REST_S = 0.2
-"""... and those of all clients so far: each may cost the ROS thread 0.1 s."""
+"""... and the interval between tries of any clients: each may cost the ROS thread 0.1 s."""
 GIVE_UP_S = 10.0
-"""A client that is not known so long after its answer was ready is gone, or never hears us."""
+"""A client still unknown this long after its answer was ready is gone, or will never hear us."""
 MAX_KEPT = 4096
-"""Answers kept, of all clients."""
+"""Answers kept for all clients together."""
 
 T = TypeVar("T")
 
@@ -33,7 +33,7 @@ class _Client(Generic[T]):
 
 
 class NewClients(Generic[T]):
-    """What waits, by client (writer guid)."""
+    """Waiting answers by client (writer guid)."""
 
     __slots__ = ("_clients", "_rests_until", "kept")
 
@@ -43,11 +43,11 @@ class NewClients(Generic[T]):
         self.kept = 0
 
     def waits(self, client: bytes) -> bool:
-        """Whether answers to this client wait: a further one must not be tried before them."""
+        """Return whether answers to this client wait: a further one must not be tried before them."""
         return client in self._clients
 
     def keep(self, client: bytes, answer: T, now: float) -> bool:
-        """Keep an answer to a client that is not known yet; False when there is no room."""
+        """Keep an answer to a client that is not known yet; return False when there is no room."""
         if self.kept >= MAX_KEPT:
             return False
         state = self._clients.get(client)
@@ -65,21 +65,21 @@ class NewClients(Generic[T]):
         return max(self._rests_until, min(state.retry_at for state in self._clients.values()))
 
     def take_due(self, now: float) -> tuple[bytes, T] | None:
-        """Return the client to be tried now and its oldest answer; say what came of it by `known` or `unknown`."""
+        """Return the client to try now and its oldest answer; the caller reports the result by `known` or `unknown`."""
         if now < self._rests_until or not self._clients:
             return None
         client, state = min(self._clients.items(), key=lambda one: one[1].retry_at)
         return (client, state.answers[0]) if state.retry_at <= now else None
 
     def known(self, client: bytes) -> list[T]:
-        """The oldest answer left: return the others, which may go as well."""
+        """Note that the oldest answer was sent; return the others, which may go as well."""
         answers = self._clients.pop(client).answers
         self.kept -= len(answers)
         answers.popleft()
         return list(answers)
 
     def unknown(self, client: bytes, now: float) -> list[T]:
-        """It did not; return those that are given up."""
+        """Note that it was not sent; return the answers that are given up."""
         state = self._clients[client]
         self._rests_until = now + REST_S
         if now < state.gives_up_at:

@@ -1,7 +1,7 @@
-"""Robot: missed deadlines and failed requests as messages on ROS topics.
+"""Publishes a robot's missed deadlines and failed requests as messages on ROS topics.
 
-`diagnostic_msgs/DiagnosticArray` ships with every ROS base installation, has a time stamp, typed key-value pairs and
-tools that show it; a type of our own would have to be built on each robot, and `rcl_interfaces/Log` has only a text.
+`diagnostic_msgs/DiagnosticArray` ships with every ROS base installation, and has a time stamp, key-value pairs and
+tools that show it. A custom type would have to be built on each robot, and `rcl_interfaces/Log` has only a text.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 DEADLINE_TOPIC = "/plr/deadline_missed"
 FAILURE_TOPIC = "/plr/request_failed"
 _TOPIC_DEPTH = 100
-"""Notices kept for a subscriber that is slow for a moment."""
+"""Notices kept for a subscriber that is briefly slow."""
 
 
 class NoticePublisher:

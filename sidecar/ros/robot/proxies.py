@@ -1,4 +1,4 @@
-"""Robot: which services are offered to the local applications, following the network and the local graph."""
+"""Decides which services a robot offers to its local applications, from the network's offers and the local graph."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ if TYPE_CHECKING:
     from sidecar.ros.stats import BridgeStats
 
 DISCOVERY_SETTLES_S = 1.0
-"""After joining the domain, nothing is offered for so long: servers that run here already must be discovered first."""
+"""How long nothing is offered after joining the domain: servers already running here must be discovered first."""
 NAME_IS_FREE_S = 0.15
-"""Nobody else must have served a name for so long. In the cloud's own domain, where robot and cloud may both
-be, the server whose service we are offered was perhaps discovered by the cloud's sidecar a moment before ours."""
+"""How long nobody else must have served a name. If robot and cloud share a domain, the cloud's sidecar may have
+discovered the server whose service we are offered a moment before ours does."""
 TYPE_RETRY_S = 30.0
-"""How often a type that is not installed is looked for again: someone may be installing it."""
+"""How often a type that is not installed is tried again: someone may be installing it."""
 
 log = logging.getLogger(__name__)
 
@@ -46,7 +46,7 @@ class Proxies:
         on_bad_request: Callable[[ServiceProxy, RosBridgeError, float], None],
         on_closed: Callable[[ServiceProxy, int], None],
     ) -> None:
-        """`on_closed` is told how many requests lay at a proxy unseen."""
+        """Call `on_closed` with the number of requests that waited unseen at the closed proxy."""
         self._loop = loop
         self._own_node = loop.node.get_fully_qualified_name()
         self._rules = Rules(rules)
@@ -55,18 +55,18 @@ class Proxies:
         self._on_bad_request = on_bad_request
         self._on_closed = on_closed
         self.offers: dict[ServiceName, str] = {}
-        """What servers in the network offer, and of which type."""
+        """Services that servers in the network offer, with their types."""
         self._proxies: dict[ServiceName, ServiceProxy] = {}
         self._missing_types: dict[ServiceName, str] = {}
         self._left_alone: dict[ServiceName, frozenset[str]] = {}
         self._free_since: dict[ServiceName, float] = {}
         self._types_retried_at = 0.0
         self.settling = False
-        """Whether a name is about to be free: another look is wanted soon."""
+        """Whether a name is about to be free, so that another look is needed soon."""
         self._settled_at = now + DISCOVERY_SETTLES_S
 
     def offer(self, event: OfferService) -> None:
-        """A server in the network offers this."""
+        """Note that a server in the network offers a service."""
         if self._rules.find(event.name) is None:
             self._stats.dropped["offer_not_in_rules"] += 1
             log.error("service %s is offered, but no rule of this sidecar carries it", event.name)
@@ -79,7 +79,7 @@ class Proxies:
         self.offers[event.name] = event.type
 
     def withdraw(self, event: WithdrawService, fallbacks: Mapping[ServiceName, str]) -> None:
-        """No server in the network offers this any more; `fallbacks`: what has one on this robot, and its type."""
+        """Note that no server in the network offers it any more; `fallbacks`: services with one here, and its type."""
         if self.offers.pop(event.name, None) is None:
             return
         self._missing_types.pop(event.name, None)
@@ -95,9 +95,9 @@ class Proxies:
     def look(
         self, served: Mapping[ServiceName, graph.Served], fallbacks: Mapping[ServiceName, str], now: float
     ) -> Iterator[None]:
-        """Compare the graph with what is to be offered, in steps; create and withdraw proxies accordingly."""
+        """Compare the graph with what should be offered, in steps; create and withdraw proxies accordingly."""
         self.settling = False
-        # What has a fallback is offered without any server as well.
+        # Services with a fallback are offered even without any server.
         wanted = {**fallbacks, **self.offers}
         for name in [name for name in self._proxies if name not in wanted]:
             self._close_proxy(name)
@@ -131,7 +131,7 @@ class Proxies:
         others = served.nodes() - {self._own_node}
         if name not in self._proxies:
             return others
-        # Two robot sidecars in one domain that proxied the name at the same moment: the smaller name stays.
+        # If two robot sidecars in one domain proxied the name at the same moment, the smaller node name stays.
         return frozenset(node for node in others if not graph.is_sidecar(node) or node < self._own_node)
 
     def _leave_alone(self, name: ServiceName, others: frozenset[str]) -> None:

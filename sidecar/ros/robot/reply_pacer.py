@@ -1,15 +1,15 @@
-"""Answers to one client, no faster than an ordinary client can take them.
+"""Paces the answers to each client, so that an ordinary client can keep up.
 
-A ROS client made with the default profile keeps the last 10 answers it has not looked at yet; the 11th pushes the
-first one out, and that call never returns. A network that was dark hands over many answers at once, so each client
-gets a few at once and the rest spaced (docs/develop/adr/0008). A client that asks one thing at a
-time is never held back: each of its requests earns an answer.
+A ROS client with the default profile keeps the last 10 unread answers; the 11th pushes out the first, and that call
+never returns. After an outage the network hands over many answers at once. So each client gets a few at once and the
+rest spaced (docs/develop/adr/0008). A client that makes one request at a time is never held back: each request earns it
+an answer.
 
-Of those held back, answers in time go before late ones: what was asked before an outage does not delay the answer to
-what is asked after it. Late ones are spaced wider, since they come in great numbers and nobody is in a hurry for them:
-a client held up by a busy machine loses none.
+Of the answers held back, those in time go before late ones: requests made before an outage do not delay the answers to
+those made after it. Late ones are spaced wider, as they come in great numbers and are not urgent: a client held up by
+a busy machine loses none.
 
-This makes losses rare, not impossible: how many answers lie unread cannot be asked.
+This makes losses rare, not impossible: there is no way to ask how many answers lie unread.
 """
 
 from __future__ import annotations
@@ -21,13 +21,13 @@ from typing import Generic, TypeVar
 BURST_ANSWERS = 8
 """Below rmw's default depth of 10, so that a few answers may still lie unread."""
 SPACING_S = 0.002
-"""Ten times what an rclpy client spends on an answer (0.15 to 0.3 ms): it may be held up for 20 ms and lose nothing."""
+"""Ten times what an rclpy client spends on an answer (0.15 to 0.3 ms): it may be held up for 20 ms without losses."""
 LATE_COST = 5.0
-"""A late answer counts for so many in time: one in 10 ms, so that a client may be held up for nearly 100 ms."""
+"""Cost of a late answer, in answers in time: one goes every 10 ms, so a client may be held up for nearly 100 ms."""
 MAX_CLIENTS = 1024
-"""Clients remembered; the one quiet for longest is forgotten, and begins again with a full allowance."""
+"""Clients remembered; the one quiet for longest is forgotten, and starts again with a full allowance."""
 
-_ROUNDING = 1e-6  # of an allowance: what is due at a time is due at that time
+_ROUNDING = 1e-6  # of an allowance: at the time `next_due` names, the answer is due
 
 T = TypeVar("T")
 
@@ -40,7 +40,7 @@ class _Client(Generic[T]):
     late: deque[T] = field(default_factory=deque)
 
     def next_waiting(self) -> deque[T]:
-        """The queue whose turn it is; empty when nothing waits."""
+        """Return the queue whose turn it is; it is empty when nothing waits."""
         return self.in_time or self.late
 
 
@@ -58,12 +58,12 @@ class ReplyPacer(Generic[T]):
         self.queued = 0
 
     def request_taken(self, client: bytes, now: float) -> None:
-        """A request of `client` arrived: it may be answered without a wait."""
+        """Note that a request of `client` arrived, which earns it one answer without a wait."""
         state = self._refreshed(client, now)
         state.tokens = min(self._burst, state.tokens + 1.0)
 
     def offer(self, client: bytes, reply: T, now: float, *, late: bool) -> bool:
-        """Return True when `reply` may go now; otherwise it is kept for `take_due`."""
+        """Return True if `reply` may go now; otherwise keep it for `take_due`."""
         state = self._refreshed(client, now)
         cost = self._late_cost if late else 1.0
         if state.tokens < cost or state.in_time or (late and state.late):
@@ -75,7 +75,7 @@ class ReplyPacer(Generic[T]):
         return True
 
     def take_due(self, now: float) -> list[T]:
-        """Return the kept answers whose time has come, for each client those in time first, then the oldest."""
+        """Return the kept answers that are due; for each client those in time first, each kind oldest first."""
         due: list[T] = []
         for client in list(self._waiting):
             state = self._refreshed(client, now)

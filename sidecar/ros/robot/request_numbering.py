@@ -1,4 +1,4 @@
-"""The identity of each request that a local application makes."""
+"""Gives each request of a local application its identity."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ if TYPE_CHECKING:
 
 
 class RequestNumbering:
-    """Names each request by session, writer guid and sequence number, so that no name comes twice.
+    """Names each request by session, writer guid and sequence number, so that no name occurs twice.
 
-    Fast DDS makes its guids of host, process number and 16 random bits, so a client that is restarted for ever in a
-    container may meet one of its own old ones. The number of arrival in this session therefore goes into the name too.
+    Fast DDS forms its guids from host, process number and 16 random bits, so a client that keeps restarting in a
+    container may repeat one of its own. So the arrival number in this session goes into the name too.
     """
 
     __slots__ = ("_arrivals", "_session")

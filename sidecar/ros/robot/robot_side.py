@@ -1,4 +1,4 @@
-"""Robot: the applications' requests, which wait for the network's answer or a fallback's."""
+"""Passes on a robot's application requests, and answers each from the network or from a fallback."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ if TYPE_CHECKING:
     from sidecar.ros.stats import BridgeStats
 
 MAX_PENDING_REQUESTS = 4096
-"""Applications' requests without an answer; beyond this new ones are dropped, for an older one may still be in time."""
+"""Application requests without an answer; beyond this, new ones are dropped, as an older one may still be in time."""
 
 log = logging.getLogger(__name__)
 
@@ -84,7 +84,7 @@ class RobotSide:
         self._notices = NoticePublisher(loop.node, name)
         self._numbering = RequestNumbering(data_plane.session)
         self._processes = ServerProcesses(loop.domain_id, lambda: graph.participants(loop.node), loop.wake)
-        """Of the fallbacks."""
+        """Server processes of the fallbacks."""
         self._names = NodeNames(loop.node, stats, limited_log)
         self._pacer: ReplyPacer[_Answer] = ReplyPacer()
         self._new_clients: NewClients[_Answer] = NewClients()
@@ -100,7 +100,7 @@ class RobotSide:
         )
         self._pending: dict[RequestId, _Pending] = {}
         self._carried: dict[ServiceName, bool | None] = {}
-        """What the data plane was told of last."""
+        """What the data plane was last told."""
         self._proxies = Proxies(
             loop=loop,
             rules=rules,
@@ -111,7 +111,7 @@ class RobotSide:
             on_closed=self._proxy_closed,
         )
         self.look_is_due = False
-        """The graph should be looked at although it has not changed."""
+        """Whether a look at the graph is due although it has not changed."""
 
     # -- what the data plane says ------------------------------------------------------------------------------
 
@@ -190,7 +190,7 @@ class RobotSide:
     def _answer(
         self, request_id: RequestId, payload: bytes | memoryview, now: float, *, late: bool
     ) -> RosBridgeError | None:
-        """Give the application its answer, once; returns why the bytes are none."""
+        """Give the application its answer, once; return the error if the bytes are no answer."""
         pending = self._pending.get(request_id)
         if pending is None or not pending.proxy.open:
             # A second answer, or the service was withdrawn while the request was on its way.
@@ -215,7 +215,7 @@ class RobotSide:
                 self._lost(answer, "too many answers wait for new clients", now)
 
     def _try_to_send(self, answer: _Answer, now: float) -> bool:
-        """False if its client is not wholly discovered yet."""
+        """Return False if the client is not fully discovered yet."""
         if not answer.proxy.open:
             self._stats.dropped["response_without_request"] += 1
             return True
@@ -293,7 +293,7 @@ class RobotSide:
         self._limited.log(logging.ERROR, (reason, proxy.name), now, "%s: a request is dropped: %s", proxy.name, detail)
 
     def _proxy_closed(self, proxy: ServiceProxy, unseen: int) -> None:
-        """The requests at a proxy that was withdrawn get no answer."""
+        """Give up the requests at a withdrawn proxy; they get no answer."""
         self._stats.requests_taken[proxy.name] += unseen
         orphans = [request_id for request_id, pending in self._pending.items() if pending.proxy is proxy]
         for request_id in orphans:
@@ -305,7 +305,7 @@ class RobotSide:
     # -- what the graph shows ------------------------------------------------------------------------------------
 
     def settling(self) -> bool:
-        """Whether another look at the graph should follow soon, although it does not change."""
+        """Return whether another look at the graph should follow soon, even if it does not change."""
         return self._fallbacks.settling or self._proxies.settling
 
     def look(self) -> Iterator[None]:
@@ -325,7 +325,7 @@ class RobotSide:
         self._publish_carried()
 
     def _uses_changed(self) -> None:
-        """What is used is what is carried and offered: another offer changes it, also of a service carried before."""
+        """Tell the data plane: a service in use is carried and offered, so any change of offers changes the uses."""
         self._publish_carried()
         self._data_plane.set_carried(self._carried)
 
@@ -348,7 +348,7 @@ class RobotSide:
         return min((due for due in dues if due is not None), default=None)
 
     def on_timer(self, now: float) -> None:
-        """Ask fallbacks in time; send the answers that were held back for their clients' sake."""
+        """Call fallbacks that are due; send the answers that were held back for their clients."""
         if self._processes.take_ended():
             self._fallbacks.strike_out(now)
         self._fallbacks.on_timer(now)

@@ -1,4 +1,4 @@
-"""Robot: one service offered in place of its server in the cloud."""
+"""Offers one service on a robot in place of its server in the cloud."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ if TYPE_CHECKING:
     from sidecar.ros.types import ServiceType
 
 QUEUE_DEPTH = 1024
-"""Requests that rmw keeps until the loop takes them. The default of 10 loses some of 100 sent at once."""
+"""Requests that rmw keeps until the loop takes them; with the default of 10, some of 100 sent at once are lost."""
 TAKEN_AT_ONCE = 32
-"""Requests taken from one service before the others have their turn."""
+"""Requests taken from one service before the next has its turn."""
 
 
 class ServiceProxy:
@@ -72,7 +72,7 @@ class ServiceProxy:
         send_response(self._pointer, request_id, response)
 
     def close(self) -> int:
-        """Withdraw the service; return how many requests lay there unseen."""
+        """Withdraw the service; return how many requests waited there unseen."""
         self.open = False
         unseen = 0
         while take_request(self._pointer, self.type.request) is not None:
@@ -83,5 +83,5 @@ class ServiceProxy:
 
 
 def _unused(_request: Any, response: Any) -> Any:
-    """rclpy wants a callback; the loop takes requests itself."""
+    """Satisfy rclpy, which requires a callback; the loop takes requests itself."""
     return response
