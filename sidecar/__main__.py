@@ -1,4 +1,4 @@
-"""plr-sidecar: command line, logging and signals around `runtime.run`."""
+"""Runs plr-sidecar: command line, logging and signals around `runtime.run`."""
 
 from __future__ import annotations
 
@@ -44,10 +44,10 @@ EXIT_FAILURE = 1
 EXIT_BAD_CONFIG = 2
 
 SHORT_DEADLINE_MS = 1.0
-"""Below this somebody thought in seconds."""
+"""A deadline below this was probably meant in seconds."""
 
 IMPATIENT_AFTER_S = 1.0
-"""A signal this long after the first ends the program at once; sooner, it is one and the same sent to a group too."""
+"""A signal this long after the first ends the program at once; an earlier one is the same, also sent to a group."""
 
 _DESCRIPTION = "Carries the ROS 2 service calls of a robot to cloud servers over every network interface."
 
@@ -66,7 +66,7 @@ exit codes:
 
 @endings.ends_quietly(PROGRAM)
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the program; returns its exit code."""
+    """Run the program and return its exit code."""
     options = _parser().parse_args(arguments)
     if options.print_schema:
         sys.stdout.write(json.dumps(config_schema(), indent=2) + "\n")
@@ -91,7 +91,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             return EXIT_OK
         return _run(config)
     except ConfigError as error:
-        # What is found out later than the file is read does not know its name; without a key it is another file's.
+        # An error found after the file was read lacks the file's name; one without a key belongs to another file.
         located = ConfigError(str(options.config), error.key, error.problem) if error.key else error
         sys.stderr.write(f"{PROGRAM}: {located}\n")
         return EXIT_FAILURE if isinstance(error, StartError) else EXIT_BAD_CONFIG
@@ -140,7 +140,7 @@ def _check_ros(*, thorough: bool) -> None:
 
 def _warn_of_missing_types(config: SidecarConfig) -> None:
     if config.role is not Role.ROBOT:
-        return  # which type a local server has shows when it runs
+        return  # the type of a local server is only known when it runs
     from sidecar.ros.graph.known_types import missing_types
     from sidecar.state.store import peek_last_good
 
@@ -167,7 +167,7 @@ def _check_certificate(config: SidecarConfig) -> None:
 def _run(config: SidecarConfig) -> int:
     _check_ros(thorough=False)
     faulthandler.enable()
-    # gRPC's own lines on stderr have another format, and what they tell is in our log.
+    # gRPC's own lines on stderr have another format, and our log says the same.
     os.environ.setdefault("GRPC_VERBOSITY", "ERROR")
     stop = StopRequest()
     logs = Logging("sidecar", config.log_level.value, sys.stderr, line_formatter(sys.stderr, "sidecar"))
@@ -176,15 +176,14 @@ def _run(config: SidecarConfig) -> int:
         try:
             problem = _certificate_problem(config)
             if problem is not None:
-                # It starts all the same: a clock is set soon after a boot, and a certificate is read anew when it is
-                # replaced.
+                # Start all the same: the clock is set soon after a boot, and a replaced certificate is read again.
                 log.log(logging.WARNING if problem.in_force else logging.ERROR, "%s", problem.text)
-            # Late: it takes a second to import, several on a busy machine; a wrong configuration has been told by now,
-            # and a signal is heeded meanwhile.
+            # Imported late, as it takes a second, several on a busy machine: a wrong configuration has been reported by
+            # now, and signals are handled meanwhile.
             try:
                 from sidecar.runtime import run
             except ImportError:
-                # What no look at the environment shows: rclpy is there, and a library of its is not.
+                # The first check cannot see this: rclpy is there, but one of its libraries is missing.
                 _check_ros(thorough=True)
                 raise
 
@@ -201,7 +200,7 @@ def _run(config: SidecarConfig) -> int:
 
 
 def _stop_on_signals_and_crashes(stop: StopRequest) -> threading.Event:
-    """Set `stop` on SIGTERM, SIGINT and when a thread dies; returns what is set in the last case."""
+    """Set `stop` on SIGTERM, on SIGINT and when a thread dies; return the event that is set in the last case."""
     failure = threading.Event()
     stopping_since = math.inf
 

@@ -1,4 +1,4 @@
-"""The seams between the sidecar's parts: what the ROS bridge asks of the data plane, and the other way round."""
+"""Defines the seam between the ROS bridge and the data plane: what each may call of the other."""
 
 from __future__ import annotations
 
@@ -14,46 +14,46 @@ if TYPE_CHECKING:
 
 
 class DataPlane(Protocol):
-    """What the application side may call, from any thread; nothing here blocks."""
+    """The calls open to the application side, from any thread; none of them blocks."""
 
     @property
     def session(self) -> SessionId:
         """This run's session."""
 
     def submit(self, request_id: RequestId, service: ServiceName, payload: bytes) -> None:
-        """Robot: send a serialised request. It ends in exactly one RequestFailed, or with an answer judged good."""
+        """Robot: send a serialised request; it ends in exactly one RequestFailed, or with an answer judged good."""
 
     def judge_answer(self, request_id: RequestId, copy: int, problem: str | None) -> None:
-        """Robot: this copy's answer is with the application, or can not be delivered, for this reason.
+        """Robot: report that the application has this copy's answer, or the `problem` that kept it from delivery.
 
-        To be said of every ResponseArrived. After a problem another server's answer is taken.
+        It must be called for every ResponseArrived. After a problem, another server's answer is taken.
         """
 
     def answered_here(self, request_id: RequestId) -> None:
-        """Robot: the application has its answer, not from the network; how the request ends is told all the same."""
+        """Robot: report that the application has an answer from elsewhere; the request's end is told all the same."""
 
     def complete(self, execution: ExecutionId, payload: bytes, processing_s: float) -> None:
-        """Cloud: the local server answered after `processing_s` seconds."""
+        """Cloud: report that the local server answered after `processing_s` seconds."""
 
     def refuse(self, execution: ExecutionId, reason: RejectReason, detail: str) -> None:
-        """Cloud: the request was not or will not be answered."""
+        """Cloud: report that the request was not or will not be answered."""
 
     def set_offers(self, offers: tuple[ServiceOffer, ...]) -> None:
-        """Cloud: the services that local servers offer right now, a whole new set."""
+        """Cloud: replace the set of services that local servers offer now."""
 
     def set_carried(self, services: Mapping[ServiceName, bool | None]) -> None:
-        """Robot: the proxied services that exist in the local ROS graph right now, a whole new set.
+        """Robot: replace the set of proxied services that exist in the local ROS graph now.
 
-        Of each, whether its fallback can be asked; None where it has none.
+        The value says whether the service's fallback can be called; None where it has none.
         """
 
 
 class Application(Protocol):
-    """What the data plane calls."""
+    """The calls that the data plane makes."""
 
     def handle(self, event: ApplicationEvent) -> None:
-        """Take an event. Called from data-plane threads: must return at once.
+        """Take an event. Data-plane threads call this, so it must return at once.
 
-        It may call the data plane, to answer a request then and there: that saves two wake-ups, and its answer leaves
-        before the thread that received the request sleeps. What takes time (a ROS server) belongs into a queue.
+        It may call the data plane to answer a request on the spot: that saves two wake-ups, and the answer leaves
+        before the thread that received the request sleeps. Work that takes time (a ROS server) belongs in a queue.
         """

@@ -1,4 +1,4 @@
-"""Puts one sidecar together: state on disk, data plane, interfaces, ROS bridge, control client, metrics."""
+"""Assembles one sidecar: state on disk, data plane, interfaces, ROS bridge, control client, metrics."""
 
 from __future__ import annotations
 
@@ -56,18 +56,18 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 DRAIN_S = 5.0
-"""On SIGTERM, requests in flight get this long."""
+"""How long requests in flight get on SIGTERM."""
 DRAIN_POLL_S = 0.02
 STATUS_EVERY_S = 2.0
-"""How often `systemctl status` may learn how it is."""
+"""How often the status line of `systemctl status` is renewed."""
 MAX_STATUS_CHARACTERS = 500
-"""Names of services may be long."""
+"""Maximum length of the status line: names of services may be long."""
 DEFAULT_STUN_PORT = 3478
-"""RFC 8489 section 8; used on the control plane's host when nobody names a STUN server."""
+"""RFC 8489 section 8; used on the control plane's hosts when no STUN server is named."""
 
 
 class Sidecar:
-    """All parts of one sidecar; also what the control client calls (`ControlHooks`)."""
+    """All parts of one sidecar; also implements the control client's `ControlHooks`."""
 
     def __init__(self, config: SidecarConfig, version: str) -> None:
         self._config = config
@@ -87,7 +87,7 @@ class Sidecar:
         self._own = own
         self._announcer = Announcer(own.credential.session, None if tls is None else lambda: tls.current, config.labels)
         self._announcing = threading.Lock()
-        """Interfaces' threads and the control client's have news; serials go out in order."""
+        """Held while announcing: threads of interfaces and of the control client announce; serials go out in order."""
         rules = config.service_rules()
         self._bridge = RosBridge(name=config.node_name, role=config.role, rules=rules)
         self._data_plane = ThreadedDataPlane(
@@ -155,12 +155,12 @@ class Sidecar:
         self._mapping_origin: MappingOrigin | None = None
         self._local = self._make_local(version)
         self._untyped: frozenset[ServiceName] = frozenset()
-        """Services whose type was not installed at the last look."""
+        """Services whose type was missing at the last look."""
         self._logged_mappings: dict[ServiceName, tuple[Assignment, ...]] = {}
         self._version = version
 
     def start(self) -> None:
-        """Start every part; what the disk remembers is in force before the control plane is asked.
+        """Start every part; the state from disk is in force before the control plane is contacted.
 
         Raises:
             OSError: a socket is refused.
@@ -190,10 +190,10 @@ class Sidecar:
                 self._mapping_origin = MappingOrigin("disk", time.monotonic())
         self._bridge.start(self._data_plane)
         self._control.start()
-        self._control.try_again()  # an interface may have come before it was noted that the mapping lacks it
+        self._control.try_again()  # an interface may have appeared before the mapping was refused for want of it
 
     def look_at_services(self) -> None:
-        """Tell, once, of those that the configuration names and are not to be had."""
+        """Log once each service that the configuration names but that is not available."""
         stats = self._bridge.stats
         met = {*stats.carried, *stats.left_alone, *stats.missing_types}
         before = self._unmet.unmet, set(self._unmet.unreached), self._untyped
@@ -216,7 +216,7 @@ class Sidecar:
             log.warning("%s", line)
 
     def status_line(self) -> str:
-        """Return in a few words how it is, for `systemctl status`."""
+        """Return the sidecar's status in a few words, for `systemctl status`."""
         used = self._interfaces.in_use()
         carrying = [name for name, carries in used.items() if carries]
         reached = "reached" if self._control.connected else "not reached"
@@ -227,7 +227,7 @@ class Sidecar:
         )[:MAX_STATUS_CHARACTERS]
 
     def stop(self) -> None:
-        """Finish what is in flight, say goodbye, end every thread."""
+        """Finish the requests in flight, say goodbye, end every thread."""
         self._data_plane.drain()
         self._control.drain()
         end = time.monotonic() + DRAIN_S
@@ -342,22 +342,22 @@ class Sidecar:
     # -- ControlHooks, on the control client's thread -------------------------------------------------------------
 
     def welcome(self, welcome: Welcome) -> None:
-        """A stream is accepted, or the control plane has another revocation list."""
+        """Take the welcome of an accepted stream, or a new revocation list of the control plane."""
         if self._revocations is not None and welcome.crl:
             self._revocations.take_or_log(welcome.crl, "the control plane")
-        # The list is kept on its own, wherever it came from.
+        # The list is kept separately, wherever it came from.
         self._store.remember(replace(welcome, crl=b""))
         self._interfaces.set_stun_servers(self._stun_servers(welcome))
 
     def apply_peers(self, peers: PeerSet) -> str | None:
-        """Put the peers in force; returns why not, or None."""
+        """Put the peers in force; return why that failed, or None."""
         error = self._data_plane.apply_peers(peers)
         if error is None:
             self._store.remember(peers)
         return error
 
     def apply_mapping(self, mapping: MappingSet) -> str | None:
-        """Put the mapping in force; returns why not, or None."""
+        """Put the mapping in force; return why that failed, or None."""
         error = self._data_plane.apply_mapping(mapping)
         if error is None:
             self._mapping_origin = MappingOrigin("control plane", time.monotonic())
@@ -377,22 +377,22 @@ class Sidecar:
         return self._data_plane.take_report(scope)
 
     def look_at_revocations(self) -> None:
-        """A second has passed: judge the revocation lists that peers sent, and how old those in use are."""
+        """Judge the revocation lists that peers sent, and the age of those in use; called every second."""
         if self._revocations is not None and self._tls is not None:
             self._clock.note_lists(self._tls.current.trust)
             self._clock.note(self._tls.current.identity.not_before)
             self._revocations.look(self._clock.now())
 
     def end_expired(self) -> None:
-        """Part with peers whose certificates have ended by now."""
+        """Drop peers whose certificates have expired by now."""
         self._data_plane.end_expired(self._clock.now())
 
     def judge_again(self) -> None:
-        """Time has passed, or our clock was set: refused peers may be good now."""
+        """Judge refused peers again: time has passed or our clock was set, so they may be good now."""
         self._data_plane.judge_again()
 
     def certificate_changed(self, files: TlsFiles) -> None:
-        """New certificate files are in use: the credential of this session is signed anew with them."""
+        """Sign this session's credential again with the new certificate files, which are in use now."""
         credential = signed(self._own.credential, files)
         self._data_plane.renew_credential(credential)
         self._control_session.set_credential(credential.encode())
@@ -404,7 +404,7 @@ class Sidecar:
         log.info("took new certificate files from %s", files.directory)
 
     def connection_changed(self, connected: bool, reason: str) -> None:
-        """The control plane came within reach, or went out of it."""
+        """Note that the control plane was reached or lost."""
         if not connected:
             log.debug("without control plane (%s): going on with the last peers and mapping", reason)
 
@@ -417,10 +417,10 @@ def _open_store(config: SidecarConfig) -> StateStore:
 
 
 def run(config: SidecarConfig, version: str, stopping: StopRequest) -> int:
-    """Run a sidecar until `stopping` is set; returns the exit code.
+    """Run a sidecar until `stopping` is set; return the exit code.
 
     Raises:
-        StartError: the state folder cannot be had now.
+        StartError: the state folder cannot be used now.
     """
     if config.insecure:
         log.warning("insecure: true: the control plane and every peer are believed to be who they say")

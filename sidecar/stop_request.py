@@ -1,4 +1,4 @@
-"""What the main thread waits for: a signal, or a thread that died."""
+"""Holds the request to stop that the main thread waits for: after a signal, or when a thread died."""
 
 from __future__ import annotations
 
@@ -6,10 +6,10 @@ import queue
 
 
 class StopRequest:
-    """Set once, from any thread and from a signal handler, with a word on why.
+    """A request to stop, set from any thread or a signal handler, with a reason in words.
 
-    Not a `threading.Event`: its lock is not reentrant. A handler that sets one while the main thread is just about to
-    wait for it, or while a second signal interrupts the handler of the first, waits for itself for good.
+    This is no `threading.Event`, as its lock is not reentrant. A handler that sets one while the main thread is just
+    about to wait for it, or while a second signal interrupts the handler of the first, would deadlock with itself.
     """
 
     def __init__(self) -> None:
@@ -20,7 +20,7 @@ class StopRequest:
         self._reasons.put(reason)
 
     def wait(self, timeout_s: float) -> str | None:
-        """Wait until it is set, `timeout_s` at most; returns the first reason, or None. For one thread, until set."""
+        """Wait at most `timeout_s` until it is set; return the first reason, or None. For one thread, until set."""
         try:
             return self._reasons.get(timeout=timeout_s)
         except queue.Empty:
