@@ -1,1 +1,1 @@
-"""The sidecar's configuration file."""
+"""Reads the sidecar's configuration file."""

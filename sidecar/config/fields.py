@@ -1,4 +1,4 @@
-"""What the sections of the sidecar's configuration are made of."""
+"""Defines the types that the sections of the sidecar's configuration consist of."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ _SERVICE_GLOB = re.compile(r"[/*?\[][A-Za-z0-9_/*?\[\]!-]*")
 _GLOB_CHARACTERS = frozenset("*?[")
 _MAX_SERVICE_CHARACTERS = 255
 MAX_CONTROL_PLANES = 8
-"""Addresses of the control plane; each is tried over every interface."""
+"""Maximum number of addresses of the control plane; each is tried over every interface."""
 _MAX_SOCKET_BYTES = 101
-"""Of a unix socket's path, 107 (unix(7)), less the end of the group's (sidecar/local/entrance.py)."""
+"""Limit of a unix socket's path, 107 (unix(7)), minus the suffix of the group's socket (sidecar/local/entrance.py)."""
 _COPIES_WORDS = {"each": EVERY_INTERFACE, "at_most": AT_MOST_EVERY_INTERFACE}
 
 
@@ -35,7 +35,7 @@ def _check_local_socket(text: str) -> str:
 
 
 def is_glob(pattern: str) -> bool:
-    """Whether the text is a pattern rather than a name."""
+    """Return whether the text is a pattern rather than a name."""
     return not _GLOB_CHARACTERS.isdisjoint(pattern)
 
 
@@ -73,7 +73,7 @@ def _check_service_name(text: str) -> str:
 
 
 def _check_repair_share(value: object) -> float | str:
-    if value is False:  # YAML reads an unquoted off so
+    if value is False:  # YAML reads an unquoted off as false
         return "off"
     if value in ("off", "auto") and isinstance(value, str):
         return value
@@ -109,7 +109,7 @@ def _check_copies(value: object) -> Copies:
     raise ValueError(f"expected each, at_most or a number from 1 to {MAX_COPIES}, got {value!r}")
 
 
-# A YAML list becomes a tuple, a word an enum: strictness would refuse both. What the list holds stays strict.
+# A YAML list becomes a tuple, a word an enum; strict mode would refuse both. The items of a list stay strict.
 converted = Field(strict=False)
 
 

@@ -1,4 +1,4 @@
-"""The sections `services` and `networks` of the sidecar's configuration."""
+"""Defines the sections `services` and `networks` of the sidecar's configuration."""
 
 from __future__ import annotations
 
@@ -34,13 +34,13 @@ if TYPE_CHECKING:
     from sidecar.core.message.repair import Redundancy
 
 MAX_DEADLINE_MS = 60_000
-"""Where the latency histogram ends: a miss of a longer deadline could not be predicted."""
+"""End of the latency histogram: a miss of a longer deadline could not be predicted."""
 
 MIN_DEFAULT_LIFETIME_MS = 30_000.0
-"""A late answer is still worth having, and a car is out of most tunnels and dead zones by then."""
+"""Minimum default lifetime: a late answer is still useful, and a car is out of most tunnels and dead zones by then."""
 
 MIN_DROPPED_LIFETIME_MS = 10_000.0
-"""With `drop_late`: a request outlives its deadline only until it is known what became of its copies."""
+"""The same with `drop_late`: a request outlives its deadline only until the fate of its copies is known."""
 
 LIFETIME_PER_DEADLINE = 10.0
 """Default lifetime, in deadlines."""
@@ -50,13 +50,13 @@ CLOUD_LIFETIME_MS = 60_000.0
 
 MAX_EXPLORATION = 0.1
 DEFAULT_EXPLORATION = 0.01
-"""What it costs is bounded besides, see `sidecar.core.robot.dispatch.exploration`."""
+"""Default share; its cost is bounded separately, see `sidecar.core.robot.dispatch.exploration`."""
 
 MIN_HEDGE_QUANTILE, MAX_HEDGE_QUANTILE = 0.5, 0.99
-"""Below, most requests would be sent twice, which replicate does sooner; above, too few latencies are known."""
+"""Below, most requests would be sent twice, which `replicate` does sooner; above, too few latencies are known."""
 
 MAX_EXTRA_LOAD = 16.0
-"""More than a request's copies can be."""
+"""More than a request can have copies."""
 MAX_EXTRA_MB_PER_DAY = 1e9
 
 _UNLIMITED = 0
@@ -120,7 +120,7 @@ class NetworkConfig(Section):
     """Megabytes (10^6 bytes) of extra copies over it in 24 hours; none: no limit."""
 
     def budget(self) -> Budget:
-        """As the cores want it."""
+        """Return the budget in the form that the cores use."""
         day = self.extra_mb_per_day
         return Budget(self.interface, self.extra_load, None if day is None else int(day * _BYTES_PER_MB))
 
@@ -182,7 +182,7 @@ class ServiceConfig(Section):
     """Cloud: what a request costs that runs here, in the currency of the robots' networks. Default 0."""
 
     def rule(self, role: Role) -> ServiceRule:
-        """As the cores want it."""
+        """Return the rule in the form that the cores use."""
         if role is Role.CLOUD:
             lifetime_ms = self.lifetime_ms or CLOUD_LIFETIME_MS
             deadline_ms = lifetime_ms
@@ -221,7 +221,7 @@ class ServiceConfig(Section):
         return FallbackRule(ServiceName(self.fallback), in_time=in_time, takes_s=takes_s)
 
     def problems(self, role: Role) -> Iterator[tuple[str, str]]:
-        """What single keys cannot know: each key that is wrong in this role or beside others, and why."""
+        """Yield each key that is wrong in this role or beside other keys, and why."""
         if role is Role.CLOUD:
             for key in _ROBOTS_KEYS:
                 if getattr(self, key) is not None:

@@ -1,4 +1,4 @@
-"""The sidecar's configuration: one YAML file, validated once, frozen, passed in."""
+"""Defines and loads the sidecar's configuration: one YAML file, validated once, frozen, passed in."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ if TYPE_CHECKING:
     from sidecar.core.rules.budget import Budget
 
 DEFAULT_CLOUD_UDP_PORT = 24700
-"""Fixed, since a firewall rule has to name it; below Linux' ephemeral ports (32768 and up)."""
+"""Fixed, as a firewall rule has to name it; below Linux's ephemeral ports (32768 and up)."""
 
 
 class LogLevel(enum.Enum):
@@ -146,22 +146,22 @@ class SidecarConfig(Section):
 
     @property
     def max_revocation_age(self) -> float:
-        """`max_revocation_age_s`; infinite: a list does not age."""
+        """`max_revocation_age_s`; infinite if a list does not age."""
         return math.inf if self.max_revocation_age_s is None else float(self.max_revocation_age_s)
 
     def local_socket_path(self, runtime_directory: str | None) -> Path | None:
-        """Where the local socket is; `runtime_directory` is what systemd tells the unit (RUNTIME_DIRECTORY)."""
+        """Return the path of the local socket; `runtime_directory` is systemd's RUNTIME_DIRECTORY for the unit."""
         if self.local_socket != "auto":
             return None if self.local_socket is None else Path(self.local_socket)
         folder = (runtime_directory or "").partition(":")[0]
         return (Path(folder) if folder else self.state_dir) / "sidecar.sock"
 
     def service_rules(self) -> tuple[ServiceRule, ...]:
-        """The services as the cores want them, in order."""
+        """Return the services in the form that the cores use, in order."""
         return tuple(service.rule(self.role) for service in self.services)
 
     def budgets(self) -> tuple[Budget, ...]:
-        """What extra copies may cost, by interface, in order."""
+        """Return what extra copies may cost, by interface, in order."""
         return tuple(network.budget() for network in self.networks)
 
     def labels(self, interfaces: Iterable[InterfaceName]) -> tuple[InterfaceLabel, ...]:
@@ -223,7 +223,7 @@ def _with_identity(data: dict[str, Any], identity: Identity, source: str) -> dic
 
 
 def refuse_exposed(config: SidecarConfig, source: str) -> None:
-    """Refuse to talk to others without TLS; raises ConfigError."""
+    """Refuse to talk to other machines without TLS; raise ConfigError."""
     exposed = next((address for address in config.control_plane if not is_loopback(address)), None)
     if config.insecure and exposed is not None:
         problem = (
@@ -236,7 +236,7 @@ def refuse_exposed(config: SidecarConfig, source: str) -> None:
 def config_schema() -> dict[str, Any]:
     """Return the JSON Schema of the configuration file."""
     schema = SidecarConfig.model_json_schema()
-    # With tls_dir the certificate has them.
+    # With tls_dir the certificate holds them.
     schema["required"] = [key for key in schema["required"] if key not in ("name", "role")]
     return {"$schema": "https://json-schema.org/draft/2020-12/schema", **schema}
 
@@ -245,7 +245,7 @@ _Problem = tuple[tuple[str | int, ...], str]
 
 
 def _cross_checks(config: SidecarConfig) -> Iterator[_Problem]:
-    """Yield what single fields cannot know; a key that would have no effect is refused, not ignored."""
+    """Yield problems between fields; a key that would have no effect is refused, not ignored."""
     if config.max_revocation_age_s is not None and config.tls_dir is None:
         yield ("max_revocation_age_s",), "expected beside tls_dir only: nothing is checked in insecure mode"
     for index, service in enumerate(config.services):
