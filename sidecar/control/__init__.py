@@ -1,1 +1,1 @@
-"""The control stream over gRPC: what drives `sidecar.core.control`."""
+"""Drives `sidecar.core.control` with a control stream over gRPC."""

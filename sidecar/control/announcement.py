@@ -1,4 +1,4 @@
-"""What this run announces of its addresses: no more than peers use, numbered, and signed with the certificate's key."""
+"""Announces this run's addresses: no more than peers use, numbered, and signed with the certificate's key."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ log = logging.getLogger(__name__)
 
 
 class Announcer:
-    """Makes the announcements of one session; not for several threads at once.
+    """Makes the announcements of one session; it must not be used by several threads at once.
 
-    `tls` returns the present certificate and key, None is the insecure mode. `labels` tells what is known of
+    `tls` returns the current certificate and key; None means insecure mode. `labels` returns what is known of
     interfaces.
     """
 
@@ -43,9 +43,9 @@ class Announcer:
         self._left_out: dict[InterfaceName, int] = {}
 
     def announce(self, candidates: Iterable[Candidate], down: Iterable[InterfaceName] = ()) -> CandidateSet:
-        """Return the announcement of these candidates, of each interface the best first: some 0.1 ms.
+        """Return the announcement of these candidates, the best of each interface first; it takes some 0.1 ms.
 
-        `down`: interfaces that would have candidates if they carried anything.
+        `down` lists interfaces that would have candidates if they carried anything.
         """
         found = tuple(candidates)
         announced = {candidate.interface for candidate in found}
@@ -55,7 +55,7 @@ class Announcer:
         return self.again()
 
     def again(self) -> CandidateSet:
-        """Return the last announcement, signed with the certificate of now."""
+        """Return the last announcement, signed with the current certificate."""
         self._serial += 1
         signature = b""
         if self._tls is not None:
@@ -69,7 +69,7 @@ class Announcer:
         left_out = Counter(one.interface for one in found) - Counter(one.interface for one in self._candidates)
         for name in left_out.keys() - self._left_out.keys():
             log.warning("%s: %d of its addresses are not announced: peers use few of each", name, left_out[name])
-        self._left_out.update(left_out)  # once in a run
+        self._left_out.update(left_out)  # logged once in a run
 
 
 def _first_of_each(candidates: Iterable[Candidate]) -> Iterator[Candidate]:

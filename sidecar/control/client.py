@@ -1,10 +1,10 @@
-"""Drives the control stream over gRPC: one thread with its own event loop, away from the data plane.
+"""Drives the control stream over gRPC on one thread with its own event loop, separate from the data plane.
 
-All decisions are ControlSession's. Connections are made by the dialer, to which gRPC connects; nothing here is called
-by, or waited for by, a thread that moves datagrams.
+ControlSession makes all decisions. The dialer makes the connections, and gRPC connects to the dialer. No thread that
+moves datagrams calls anything here, or waits for it.
 
-grpc.aio rather than a synchronous stub: at a report each 0.5 s the latter needs two more threads and some more
-wake-ups, each of which may take the interpreter from a data-plane thread.
+grpc.aio is used rather than a synchronous stub: with a report every 0.5 s, the latter needs two more threads and some
+more wake-ups, each of which may take the interpreter from a data-plane thread.
 """
 
 from __future__ import annotations
@@ -51,16 +51,19 @@ GOODBYE_S = 0.5
 """How long `stop` waits for the control plane to take the goodbye."""
 
 LOOK_INTERVAL_S = 1.0
-"""How often to look for new certificate files and revocation lists, and for peers whose certificates have ended."""
+"""How often to look for new certificate files and revocation lists, and for peers whose certificates have expired."""
 
 JUDGE_AGAIN_S = 10.0
-"""Between two judgements on refused peers: a robot without a clock hears the time soon after its start, and 4096 peers
-are a second of public-key work."""
+"""Interval between two judgements of refused peers: a robot without a clock learns the time soon after its start, and
+4096 peers take a second of public-key work."""
 
 
 class _StreamEndedError(Exception):
-    """The stream is over. `refused`: by a decision of the control plane. `wanted`: by ours, to open another. `moved`:
-    there is a better way to the control plane."""
+    """The stream is over.
+
+    `refused`: by a decision of the control plane. `wanted`: by our own, to open another. `moved`: there is a better way
+    to the control plane.
+    """
 
     def __init__(self, reason: str, *, refused: bool = False, wanted: bool = False, moved: bool = False) -> None:
         super().__init__(reason)
@@ -71,13 +74,13 @@ class _StreamEndedError(Exception):
 
 
 class ControlView(NamedTuple):
-    """How the control stream is at one moment; times are monotonic seconds."""
+    """State of the control stream at one moment; times are monotonic seconds."""
 
     names: tuple[str, ...]
     """As configured."""
     connected: bool
     since: float
-    """When that became so, or the start."""
+    """When `connected` last changed, or the start."""
     way: str | None
     """Address and interface of the connection, in words."""
     interface: str | None
@@ -87,9 +90,9 @@ class ControlView(NamedTuple):
 
 
 class ControlClient:
-    """Keeps one sidecar connected to the control plane that `dialer` reaches until `stop`.
+    """Keeps one sidecar connected to the control plane that `dialer` reaches, until `stop`.
 
-    `tls` holds the certificate to show; None in insecure mode.
+    `tls` holds the certificate to present; None in insecure mode.
     """
 
     def __init__(
@@ -123,11 +126,11 @@ class ControlClient:
 
     @property
     def stats(self) -> ControlStats:
-        """Counters, to be read only."""
+        """Counters, read-only."""
         return self._session.stats
 
     def view(self) -> ControlView:
-        """Return how the stream is, for people."""
+        """Return the state of the stream, for people."""
         line = self._line
         way = None if line is None else line.way
         return ControlView(
@@ -146,7 +149,7 @@ class ControlClient:
         self._running.wait()
 
     def set_candidates(self, candidates: CandidateSet) -> None:
-        """Tell the control plane under which addresses we are reached now, and what is known of our interfaces."""
+        """Tell the control plane at which addresses we are reachable now, and what is known of our interfaces."""
         self._post(lambda: self._session.set_candidates(candidates))
 
     def set_services(self, services: ServiceSet) -> None:
@@ -158,19 +161,19 @@ class ControlClient:
         self._post(lambda: self._session.set_revocations(held))
 
     def report_at_once(self, scope: ReportScope) -> None:
-        """Something happened that the control plane should hear of before the next report is due, and no more."""
+        """Report only `scope` before the next report is due: something happened that the control plane should know."""
         self._post(lambda: self._session.report_at_once(time.monotonic(), scope))
 
     def try_again(self) -> None:
-        """Interfaces or peers are others now: a mapping that was refused for want of them may fit."""
+        """Try a refused mapping again: interfaces or peers have changed, and it may fit now."""
         self._post(self._try_refused)
 
     def drain(self) -> None:
-        """Say that we are going; what is in flight goes on, and so does the stream."""
+        """Announce that we are leaving; requests in flight and the stream go on."""
         self._post(self._session.drain)
 
     def stop(self) -> None:
-        """Say goodbye and end the thread; returns after about GOODBYE_S at most, whatever the control plane does."""
+        """Say goodbye and end the thread; return after about GOODBYE_S at most, whatever the control plane does."""
         self._post(self._begin_stop)
         if self._thread.is_alive():
             self._thread.join(4.0 * GOODBYE_S)
@@ -178,7 +181,7 @@ class ControlClient:
                 log.warning("the control client does not end; leaving it behind")
 
     def _post(self, action: Callable[[], None]) -> None:
-        """Run `action` on the control thread; before `start` right here."""
+        """Run `action` on the control thread; before `start`, on the calling thread."""
         if self._loop is None:
             action()
             return
@@ -187,7 +190,7 @@ class ControlClient:
             action()
             self._wake.set()
 
-        # A loop that has just ended takes no calls: then there is nobody left to tell.
+        # A loop that has just ended takes no calls; then there is nothing left to do.
         with contextlib.suppress(RuntimeError):
             self._loop.call_soon_threadsafe(run)
 
@@ -210,13 +213,12 @@ class ControlClient:
             while not self._stopping:
                 await self._wait_for_turn()
                 if not self._stopping:
-                    # In a task of its own: a TaskGroup that ends with an error leaves a cancellation counted in its
-                    # task, and up to Python 3.11.2, Debian 12's, that turns the next asyncio.timeout into the task's
-                    # cancellation.
+                    # In a separate task: a TaskGroup that ends with an error leaves a cancellation counted in its task.
+                    # Up to Python 3.11.2 (Debian 12), that turns the next asyncio.timeout into the task's cancellation.
                     await asyncio.create_task(self._one_stream())
         except asyncio.CancelledError:
             if not self._stopping:
-                raise  # ends the program, which is started again: without this thread nothing ever connects
+                raise  # ends the program, which is restarted: without this thread nothing ever connects
         finally:
             self._dialer.close()
             judging.cancel()
@@ -226,8 +228,11 @@ class ControlClient:
         self._wake.set()
 
     async def _look_at_credentials(self) -> None:
-        """Also without any stream: while our clock is wrong, the control plane's certificate is no good either, and an
-        operator's new revocation list counts also while the control plane is away."""
+        """Judge credentials periodically, even without any stream.
+
+        While our clock is wrong, the control plane's certificate is no good either, and an operator's new revocation
+        list counts even while the control plane is away.
+        """
         again_at = time.monotonic() + JUDGE_AGAIN_S
         while True:
             await asyncio.sleep(min(LOOK_INTERVAL_S, JUDGE_AGAIN_S))
@@ -298,13 +303,13 @@ class ControlClient:
 
     async def _await_end(self, line: ControlLine) -> None:
         """End the stream when there is no way to the control plane, or a better one than the stream's."""
-        end = await asyncio.shield(line.ended)  # `over` asks it, after this task was cancelled
+        end = await asyncio.shield(line.ended)  # `over` reads it after this task was cancelled
         if isinstance(end, str):
             raise _StreamEndedError(end)
         raise _StreamEndedError(end.reason, wanted=end.cause == CHEAPER, moved=True)
 
     async def _watch_files(self) -> None:
-        """End the stream when there is another certificate to show."""
+        """End the stream when there is a new certificate to present."""
         await self._new_files.wait()
         raise _StreamEndedError("new certificate files", wanted=True)
 
@@ -339,14 +344,14 @@ class ControlClient:
             task = asyncio.current_task()
             if task is None or task.cancelling():
                 raise
-            # Not we were cancelled, but the call.
+            # The call was cancelled, not this task.
             raise _StreamEndedError("cancelled") from error
         raise _StreamEndedError("closed by the control plane")
 
     async def _write(self, call: _Call) -> None:
         while True:
             self._wake.clear()
-            # Before the messages are collected: a stop during the writes below still has its goodbye to send.
+            # Read before the messages are collected: a stop during the writes below still has its goodbye to send.
             stopping = self._stopping
             now = time.monotonic()
             self._session.handle_timer(now)
@@ -360,12 +365,12 @@ class ControlClient:
                     await call.done_writing()
                     return
             except (grpc.aio.AioRpcError, asyncio.InvalidStateError):
-                # The stream has ended; why, the reader learns.
+                # The stream has ended; the reader learns why.
                 return
             await self._woken_within(self._session.next_timer() - time.monotonic())
 
     async def _await_welcome(self, line: ControlLine) -> None:
-        """A network that swallows everything lets gRPC try for 20 s: give up sooner."""
+        """Give up on an overdue welcome: in a network that swallows everything, gRPC alone would try for 20 s."""
         await asyncio.sleep(max(self._session.next_timer() - time.monotonic(), 0.0))
         if self._session.welcome_overdue(time.monotonic()):
             raise _StreamEndedError(line.describe() or f"no answer to the registration at {line.way}")
@@ -408,7 +413,7 @@ class ControlClient:
             self._refusals.refused(apply.resource, what, error, failure)
 
     def _put_in_force(self, apply: Apply) -> tuple[str | None, Exception | None]:
-        """Return why it is refused, or None, and the fault of ours that is the reason, if one is."""
+        """Return why it is refused, or None, and the internal failure behind that, if any."""
         content = apply.content
         try:
             if isinstance(content, PeerSet):

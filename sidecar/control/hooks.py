@@ -1,4 +1,4 @@
-"""What the control client asks of the sidecar around it."""
+"""Defines what the control client requires of the sidecar around it."""
 
 from __future__ import annotations
 
@@ -14,31 +14,31 @@ if TYPE_CHECKING:
 
 
 class ControlHooks(Protocol):
-    """What the control client calls, on its own thread; it may wait there for the engine's lock."""
+    """The calls that the control client makes, on its own thread; they may wait there for the engine's lock."""
 
     def welcome(self, welcome: Welcome) -> None:
-        """A stream is accepted; also the place of the STUN servers."""
+        """Take the welcome of an accepted stream, which also names the STUN servers."""
 
     def apply_peers(self, peers: PeerSet) -> str | None:
-        """Put the peers in force; returns why not, or None."""
+        """Put the peers in force; return why that failed, or None."""
 
     def apply_mapping(self, mapping: MappingSet) -> str | None:
-        """Put the mapping in force; returns why not, or None."""
+        """Put the mapping in force; return why that failed, or None."""
 
     def take_report(self, scope: ReportScope) -> Report:
         """Return what was measured since the last call."""
 
     def connection_changed(self, connected: bool, reason: str) -> None:
-        """The control plane came within reach, or went out of it."""
+        """Note that the control plane was reached or lost."""
 
     def look_at_revocations(self) -> None:
-        """A second has passed: judge the revocation lists that peers sent, and how old those in use are."""
+        """Judge the revocation lists that peers sent, and the age of those in use; called every second."""
 
     def end_expired(self) -> None:
-        """Part with peers whose certificates have ended by now."""
+        """Drop peers whose certificates have expired by now."""
 
     def judge_again(self) -> None:
-        """Time has passed, or our clock was set: refused peers may be good now."""
+        """Judge refused peers again: time has passed or our clock was set, so they may be good now."""
 
     def certificate_changed(self, files: TlsFiles) -> None:
-        """New certificate files are in use from now on; the session tells the next registration of them."""
+        """Take the new certificate files, which are in use from now on; the session uses them to register next time."""

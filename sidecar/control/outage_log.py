@@ -1,4 +1,4 @@
-"""Log lines for the loss of something that is tried for ever."""
+"""Logs the loss of the control plane, which is retried forever."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ if TYPE_CHECKING:
 REPEATED_FAILURE_LOG_S = 60.0
 """An outage is logged when it starts or its reason changes, and this often while it lasts."""
 _AGE = re.compile(r"[0-9]+ (?=seconds|minutes|hours|days)")
-"""That a certificate has been expired for a second longer is no other reason."""
+"""Ages are ignored: a certificate that has been expired for one more second is no new reason."""
 
 
 class OutageLog:
-    """Says when the control plane is lost and found, without a line for every attempt between."""
+    """Logs when the control plane is lost and found, without a line for every attempt in between."""
 
     def __init__(self, log: logging.Logger, target: str) -> None:
         self._log = log
@@ -26,7 +26,7 @@ class OutageLog:
         self._kind = ""
 
     def failed(self, reason: str, delay_s: float, now: float, *, was_connected: bool) -> None:
-        """An attempt failed or a stream ended at `now`; the next attempt comes in `delay_s`."""
+        """Note that an attempt failed or a stream ended at `now`; the next attempt follows in `delay_s`."""
         self._attempts = 1 if was_connected else self._attempts + 1
         quiet = now - self._logged_at < REPEATED_FAILURE_LOG_S and self._attempts > 1
         kind = _AGE.sub("", reason)
@@ -47,7 +47,7 @@ class OutageLog:
         )
 
     def over(self, where: str) -> None:
-        """The control plane answered there."""
+        """Note that the control plane answered at `where`."""
         self._log.info("registered with the control plane %s", where)
         self._attempts = 0
         self._kind = ""

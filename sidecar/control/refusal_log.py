@@ -1,4 +1,4 @@
-"""Log lines for what is refused of the control plane, which sends it again until it is taken."""
+"""Logs what is refused from the control plane, which sends it again until it is accepted."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ if TYPE_CHECKING:
 
 
 class RefusalLog:
-    """Says what is refused and why: once, until the reason changes or something of that resource is taken."""
+    """Logs what is refused and why: once, until the reason changes or something of that resource is accepted."""
 
     def __init__(self, log: logging.Logger) -> None:
         self._log = log
         self._told: dict[ResourceKind, str] = {}
 
     def refused(self, resource: ResourceKind | None, what: str, error: str, failure: Exception | None = None) -> None:
-        """This was refused; `resource` is None if it is not known which it is of, `failure` is a fault of ours."""
+        """Log a refusal; `resource` is None if unknown, and `failure` is an internal failure behind it."""
         level = logging.WARNING if failure is None else logging.ERROR
         if resource is not None:
             if self._told.get(resource) == error:
@@ -26,5 +26,5 @@ class RefusalLog:
         self._log.log(level, "refused %s: %s", what, error, exc_info=failure)
 
     def taken(self, resource: ResourceKind) -> None:
-        """The next refusal is news again."""
+        """Note an acceptance: the next refusal is news again."""
         self._told.pop(resource, None)

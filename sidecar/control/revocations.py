@@ -1,7 +1,7 @@
-"""Keeps this sidecar's revocation lists, wherever they come from, and tells the data plane what they say.
+"""Keeps this sidecar's revocation lists, whatever their source, and tells the data plane what they say.
 
-A list comes in the node's folder, from the control plane, from a peer, or from disk: each is judged by `TlsWatch`, in
-the control client's thread, and has the same effect.
+A list comes from the node's folder, the control plane, a peer, or the disk. `TlsWatch` judges each on the control
+client's thread, and all have the same effect.
 """
 
 from __future__ import annotations
@@ -27,37 +27,37 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 MAX_HEARD = 16
-"""Lists of peers that wait to be judged, which happens every second; the exchange asks for one in 5 s."""
+"""Peers' lists that may wait to be judged, which happens every second; the exchange asks for one every 5 s."""
 CLOCK_SLACK_S = 300.0
-"""A list signed so much later than now says that this clock is behind: as much as certificates begin in the past."""
+"""A list signed this much later than now shows that this clock is behind; certificates are backdated by as much."""
 
 
 class RevocationUser(Protocol):
-    """What the data plane does about revocations."""
+    """The data plane's part in revocations."""
 
     def trust_changed(self) -> None:
-        """Judge all peers anew."""
+        """Judge all peers again."""
 
     def set_revocations(self, numbers: Mapping[int, int], pem: bytes) -> None:
-        """Tell peers of these lists, and have them when they ask."""
+        """Announce these lists to peers, and hold them ready for requests."""
 
     def judged_revocations(self, peer: NodeName, *, good: bool) -> None:
-        """What a peer sent is taken, or is no list of our CAs."""
+        """Report whether a peer's lists were taken, or are none of our CAs."""
 
 
 @dataclass(frozen=True, slots=True)
 class RevocationState:
-    """What metrics show."""
+    """State of the revocation lists for the metrics."""
 
     lists: Mapping[int, RevocationList | None]
     """As `Trust.lists`."""
     too_old: frozenset[int]
-    """CAs whose lists are older than may be: whom they certified is not talked to."""
+    """CAs whose lists are too old; nodes that they certified are not talked to."""
     max_age_s: float
 
 
 class Revocations:
-    """`heard` and `state` may be called from any thread, everything else from that of the control client only."""
+    """The lists in use. Any thread may call `heard` and `state`, only the control client's may call the rest."""
 
     def __init__(
         self,
@@ -67,9 +67,9 @@ class Revocations:
         show: Callable[[RevocationSet], None],
         max_age_s: float = math.inf,
     ) -> None:
-        """`remember` keeps lists over a restart; `show` tells the operator which they are.
+        """Use `remember` to keep lists across a restart, and `show` to tell the operator which they are.
 
-        `max_age_s`: beyond it nobody is believed (`Trust.check`).
+        Peers of a CA whose list is older than `max_age_s` are not believed (`Trust.check`).
         """
         self._tls = tls
         self._data_plane = data_plane
@@ -78,25 +78,25 @@ class Revocations:
         self._max_age_s = max_age_s
         self._heard: deque[tuple[NodeName, bytes]] = deque()
         self._complained: set[NodeName] = set()
-        """Whose bad lists were logged; names of peers only, as many as there are."""
+        """Peers whose bad lists were logged; at most as many as there are peers."""
         self._too_long = False
         self._clock_behind = False
         self._too_old: frozenset[int] = frozenset()
 
     @property
     def state(self) -> RevocationState:
-        """What is in use."""
+        """The lists in use."""
         return RevocationState(self._tls.current.trust.lists(), self._too_old, self._max_age_s)
 
     def heard(self, peer: NodeName, pem: bytes) -> None:
-        """A peer sent lists: `look` judges them."""
+        """Queue lists that a peer sent; `look` judges them."""
         if len(self._heard) == MAX_HEARD:
             log.warning("a revocation list is dropped unseen: %d others wait to be judged", MAX_HEARD)
             return
         self._heard.append((peer, pem))
 
     def take(self, pem: bytes, source: str) -> bool:
-        """Believe these lists too; whether they say anything new. Raises CertificateError."""
+        """Add these lists to those in use; return whether they say anything new. Raises CertificateError."""
         if not self._tls.take_revocations(pem):
             return False
         trust = self._tls.current.trust
@@ -108,14 +108,14 @@ class Revocations:
         return True
 
     def take_or_log(self, pem: bytes, source: str) -> None:
-        """The same, but bad ones are logged."""
+        """Do the same, but log bad lists instead of raising."""
         try:
             self.take(pem, source)
         except CertificateError as error:
             log.warning("a revocation list of %s is ignored: %s", source, error)
 
     def tell(self) -> None:
-        """The lists in use may be others now."""
+        """Tell the data plane and the operator which lists are in use; they may have changed."""
         trust = self._tls.current.trust
         pem = trust.crl_pem()
         too_long = len(pem) > MAX_CRL_BYTES
@@ -130,7 +130,7 @@ class Revocations:
         self._show(revocation_set(self._tls.current.trust.lists(), len(self._too_old)))
 
     def look(self, now_wall: float) -> None:
-        """Judge what peers sent, and how old the lists are by now (seconds since 1970). To be called every second."""
+        """Judge what peers sent, and how old the lists are at `now_wall` (seconds since 1970). Call it every second."""
         while self._heard:
             self._judge(*self._heard.popleft())
         self._look_at_ages(now_wall)
