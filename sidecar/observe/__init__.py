@@ -1,1 +1,1 @@
-"""What the sidecar shows: metrics and unmet services."""
+"""Shows how the sidecar is doing: metrics and unmet services."""

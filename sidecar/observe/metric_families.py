@@ -1,4 +1,4 @@
-"""From plain values to Prometheus' metric families."""
+"""Turns plain values into Prometheus metric families."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ DURATION_BOUNDS_S = (
     0.001, 0.002, 0.003, 0.005, 0.0075, 0.01, 0.015, 0.02, 0.03, 0.04, 0.05, 0.075, 0.1, 0.125, 0.15, 0.2, 0.25, 0.3,
     0.4, 0.5, 0.75, 1.0, 1.5, 2.0, 3.0, 5.0, 10.0, 30.0, 60.0,
 )  # fmt: skip
-"""Upper bounds of the exported buckets, seconds: dense where deadlines of robots lie."""
+"""Upper bounds of the exported buckets in seconds, dense in the range of robots' deadlines."""
 
 K = TypeVar("K", bound=tuple[str, ...])
 S = TypeVar("S", bound=str)
 
 
 def counter(name: str, text: str, labels: tuple[str, ...], values: Mapping[K, float]) -> CounterMetricFamily:
-    """Return a counter, `values` by the values of its labels; its name gets _total."""
+    """Return a counter with `values` by label values; _total is added to its name."""
     family = CounterMetricFamily(name, text, labels=labels)
     for key, value in dict(values).items():
         family.add_metric(key, value)
@@ -34,7 +34,7 @@ def counter(name: str, text: str, labels: tuple[str, ...], values: Mapping[K, fl
 
 
 def gauge(name: str, text: str, labels: tuple[str, ...], values: Mapping[K, float]) -> GaugeMetricFamily:
-    """Return a gauge, `values` by the values of its labels."""
+    """Return a gauge with `values` by label values."""
     family = GaugeMetricFamily(name, text, labels=labels)
     for key, value in dict(values).items():
         family.add_metric(key, float(value))
@@ -42,12 +42,12 @@ def gauge(name: str, text: str, labels: tuple[str, ...], values: Mapping[K, floa
 
 
 def by_one(values: Mapping[S, float]) -> dict[tuple[str, ...], float]:
-    """Return the values under keys of one label."""
+    """Return the values keyed by tuples of one label."""
     return {(key,): count for key, count in dict(values).items()}
 
 
 def cumulative(histogram: Histogram) -> tuple[list[tuple[str, float]], float]:
-    """Return (upper bound, count up to it) and the sum of seconds, each bucket counted whole by its middle (2 %)."""
+    """Return (upper bound, count up to it) and the sum of seconds; each bucket is placed by its middle (2 % error)."""
     inside = [0] * (len(DURATION_BOUNDS_S) + 1)
     indices, counts, _ = histogram.to_sparse()
     for index, count in zip(indices, counts, strict=True):
@@ -57,4 +57,4 @@ def cumulative(histogram: Histogram) -> tuple[list[tuple[str, float]], float]:
 
 
 _POSITIONS = (*(bisect_left(DURATION_BOUNDS_S, middle) for middle in MIDS[:-1]), len(DURATION_BOUNDS_S))
-"""For each bucket of the histogram, which exported bucket it belongs to; the overflow to +Inf."""
+"""Exported bucket of each bucket of the histogram; the overflow belongs to +Inf."""

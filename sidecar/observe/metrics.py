@@ -1,6 +1,6 @@
-"""The sidecar's metrics for Prometheus, built at scrape time from the plain counters that the cores keep.
+"""Builds the sidecar's Prometheus metrics at scrape time from the plain counters that the cores keep.
 
-No code of prometheus_client runs where datagrams move: a scrape reads, on its own thread, what is there.
+No code of prometheus_client runs where datagrams move: a scrape reads the counters on its own thread.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ _OUTCOMES = ("ok", "deadline_missed", "failed", "rejected")
 
 @dataclass(frozen=True, slots=True)
 class MetricSources:
-    """Where the counters are; each is asked at every scrape, on the scrape's thread, and must not block."""
+    """Sources of the counters; each is called at every scrape, on the scrape's thread, and must not block."""
 
     name: str
     role: str
@@ -50,23 +50,23 @@ class MetricSources:
     engine: Callable[[], EngineStats]
     links: Callable[[], Iterable[LinkStats]]
     interfaces: Callable[[], Mapping[InterfaceName, bool]]
-    """Those wanted, and whether each can carry something."""
+    """Wanted interfaces, and whether each can carry anything."""
     control: Callable[[], ControlStats]
     connected: Callable[[], bool]
-    """Whether the control plane is within reach."""
+    """Whether the control plane is reachable."""
     bridge: Callable[[], BridgeStats] | None
     unmet: Callable[[], Iterable[str]]
-    """Services that the configuration names and nobody serves."""
+    """Services that the configuration names but nobody serves."""
     state_failures: Callable[[], Mapping[str, int]]
-    """Files of the state folder that could not be read or written, by what failed."""
+    """Failures to read or write files of the state folder, by kind."""
     certificate: Callable[[], Identity | None]
-    """Whose certificate is in use; None in insecure mode."""
+    """Identity in the certificate in use; None in insecure mode."""
     files_refused: Callable[[], bool]
-    """Whether the TLS files on the disk are not taken."""
+    """Whether the TLS files on disk are refused."""
     revocations: Callable[[], RevocationState | None]
     """The revocation lists in use; None in insecure mode."""
     local_refused: Callable[[], Mapping[str, int]]
-    """What the local socket refused."""
+    """Refusals of the local socket, by reason."""
 
 
 class SidecarCollector(Collector):
@@ -115,7 +115,7 @@ class SidecarCollector(Collector):
 
 
 def serve_metrics(listen: str, sources: MetricSources) -> MetricsServer:
-    """Serve /metrics on `listen` (address:port), as soon as that can be had."""
+    """Serve /metrics on `listen` (address:port), as soon as that is available."""
     registry = CollectorRegistry()
     registry.register(SidecarCollector(sources))
     ProcessCollector(registry=registry)

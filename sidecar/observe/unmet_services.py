@@ -1,5 +1,6 @@
-"""Which services the configuration names and are not to be had: nobody serves them, and most often the name is wrong;
-or a robot reaches none of the servers that it knows of.
+"""Finds services that the configuration names but that are not available.
+
+Either nobody serves them, most often because the name is wrong, or a robot reaches none of the servers that it knows.
 """
 
 from __future__ import annotations
@@ -15,23 +16,23 @@ if TYPE_CHECKING:
 
 
 GRACE_S = 15.0
-"""After the start: what servers, their discovery and the control plane take, also on a slow machine."""
+"""Time after the start that servers, their discovery and the control plane take, even on a slow machine."""
 MAX_NAMES_SHOWN = 10
 
 
 class UnmetServices:
-    """Follows the names, not the globs, of the configuration. Pure: the time is given (s)."""
+    """Tracks the names, not the globs, of the configuration. Pure: the time is passed in (s)."""
 
     def __init__(self, patterns: Iterable[str], now: float) -> None:
         self._names = tuple(pattern for pattern in patterns if not is_glob(pattern))
         self._judged_from = now + GRACE_S
         self._told: set[str] = set()
         self.unmet: frozenset[str] = frozenset()
-        """Those that nobody served at the last look."""
+        """Services that nobody served at the last look."""
         self.unreached: Mapping[str, int] = {}
-        """Those that some serve of whom none was reached at the last look, and how many these are."""
+        """Services of which no server was reached at the last look, with the number of servers known."""
         self._coming: frozenset[str] = frozenset()
-        """Those that somebody served at the last look; it may have begun a moment before."""
+        """Services that somebody served at the last look, perhaps only just."""
 
     def look(
         self,
@@ -40,10 +41,10 @@ class UnmetServices:
         now: float,
         coming: Iterable[ServiceName] = (),
     ) -> list[str]:
-        """Note which are served now, and how many servers of others are known and not reached; return those never seen
-        served, each once, when it is time to tell of them.
+        """Note which services are served now; return those never seen served, each once, when it is time to report.
 
-        `coming`: those that somebody serves, whether or not they can be had: it takes a moment until they can.
+        `unreached` counts the known servers of others that are not reached. `coming` lists services that somebody
+        serves, whether or not they are available: that takes a moment.
         """
         before, self._coming = self._coming, frozenset(coming)
         if now < self._judged_from:
