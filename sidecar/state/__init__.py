@@ -1,1 +1,1 @@
-"""What the sidecar keeps on disk and what it draws at each start."""
+"""Keeps the sidecar's state on disk, and draws the session of each start."""

@@ -1,4 +1,4 @@
-"""Layout of the sidecar's files on disk, and their codec; no IO.
+"""Defines and codes the layout of the sidecar's files on disk; does no IO.
 
     offset  size
          0     8  magic: "plr-id\\0\\0" identity, "plr-last" last good messages of the control plane,
@@ -39,10 +39,10 @@ if TYPE_CHECKING:
     from protos.model.stream import ControlMessage
 
 FORMAT_VERSION = 1
-"""Of a file; another one is refused."""
+"""Format version of a file; any other is refused."""
 
 LAST_GOOD_VERSION = 2
-"""Since 2 the tokens of peers are those for this sidecar alone, and their addresses are signed."""
+"""Since version 2 the tokens of peers are specific to this sidecar, and their addresses are signed."""
 
 MAX_FILE_BYTES = 64 << 20
 """Well above the largest peer set and mapping that the control stream can carry."""
@@ -61,26 +61,26 @@ _LENGTH = struct.Struct("!I")
 
 @dataclass(frozen=True, slots=True)
 class Identity:
-    """What makes the sidecar the same one after a restart."""
+    """The sidecar's identity across restarts."""
 
     token: bytes = field(repr=False)
     """`TOKEN_BYTES` random bytes, drawn once."""
     incarnation: int
-    """Grows with every start."""
+    """A number that grows with every start."""
 
 
 @dataclass(frozen=True, slots=True)
 class ControlAddresses:
-    """Where a control plane let the sidecar in, the newest first."""
+    """Addresses where a control plane accepted the sidecar, newest first."""
 
     names: tuple[str, ...]
-    """The configured host:port names; of no use with others."""
+    """The configured host:port names; the addresses are void with any others."""
     addresses: tuple[Address, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
 class LastGood:
-    """What the control plane said last and the sidecar put in force."""
+    """The last messages of the control plane that the sidecar put in force."""
 
     owner: NodeName
     welcome: Welcome | None = None
@@ -88,7 +88,7 @@ class LastGood:
     mapping: MappingSet | None = None
 
     def with_message(self, message: ControlMessage) -> LastGood:
-        """Return this with `message` in place of the last one of its kind."""
+        """Return a copy with `message` in place of the last one of its kind."""
         match message:
             case Welcome():
                 return replace(self, welcome=message)
@@ -123,7 +123,7 @@ def encode_last_good(last: LastGood) -> bytes:
 
 
 def decode_last_good(data: bytes, owner: NodeName) -> LastGood:
-    """Read the file's content; raises DecodeError, also when another sidecar wrote it."""
+    """Read the file's content; raises DecodeError, even if only another sidecar wrote it."""
     body = _open(_LAST_GOOD_MAGIC, data, LAST_GOOD_VERSION)
     if not body:
         raise DecodeError("no owner")

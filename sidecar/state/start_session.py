@@ -1,4 +1,4 @@
-"""Begins this run's session: a fresh key, and the credential that says whose it is. The key never leaves the memory."""
+"""Begins this run's session with a fresh key, which never leaves memory, and the credential that names its owner."""
 
 from __future__ import annotations
 
@@ -33,9 +33,10 @@ def start_session(
     clock: ClockFloor,
     max_revocation_age_s: float = math.inf,
 ) -> OwnSession:
-    """Return a new session. `tls` returns the present certificate, key and trust; None is the insecure mode.
+    """Return a new session. `tls` returns the current certificate, key and trust; None means insecure mode.
 
-    Peers are judged by `clock`. None is believed whose CA signed no revocation list in the last `max_revocation_age_s`.
+    `clock` is used to judge peers. A peer whose CA signed no revocation list in the last `max_revocation_age_s` is not
+    believed.
 
     Raises:
         ConfigError: the certificate is too long for introductions.
@@ -59,7 +60,7 @@ def start_session(
 
 
 def signed(credential: SessionCredential, tls: TlsFiles) -> SessionCredential:
-    """Return the credential with this certificate, signed: for a new session, or a renewed certificate."""
+    """Return the credential with this certificate, signed, for a new session or a renewed certificate."""
     new = replace(credential, certificate=tls.certificate_der).sign(tls.private_key)
     if len(new.encode()) > MAX_INTRODUCED_BYTES:
         problem = f"expected a certificate at least {len(new.encode()) - MAX_INTRODUCED_BYTES} bytes shorter"
@@ -68,7 +69,7 @@ def signed(credential: SessionCredential, tls: TlsFiles) -> SessionCredential:
 
 
 def preferred_aead() -> Aead:
-    """Return what this machine is quicker at: AES where the processor has instructions for it."""
+    """Return the cipher that is faster on this machine: AES where the processor has instructions for it."""
     try:
         lines = CPUINFO.read_text(encoding="utf-8", errors="replace").splitlines()
     except OSError:
@@ -78,5 +79,5 @@ def preferred_aead() -> Aead:
 
 
 def _take_as_it_is(credential: SessionCredential) -> float:
-    """Insecure mode: whatever the control plane tells is believed, for ever."""
+    """Accept a credential in insecure mode: whatever the control plane says is believed, forever."""
     return math.inf

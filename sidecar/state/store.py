@@ -1,8 +1,8 @@
-"""What a restart needs, kept on disk: who the sidecar is, and what the control plane said last.
+"""Keeps on disk what a restart needs: who the sidecar is, and what the control plane said last.
 
-Files are replaced whole (written aside, synced, renamed), so that a power cut leaves the old one or the new one. What
-cannot be read is set aside and counted, what cannot be written is logged and tried again: neither keeps the sidecar
-from running.
+Files are replaced whole (written aside, synced, renamed), so a power cut leaves either the old or the new one. A file
+that cannot be read is set aside and counted; one that cannot be written is logged and retried. Neither keeps the
+sidecar from running.
 """
 
 from __future__ import annotations
@@ -68,10 +68,10 @@ CLOSE_TIMEOUT_S = 2.0
 """How long `close` waits for the last write: a slow card must not hold up a shutdown."""
 
 MIN_WRITE_INTERVAL_S = 1.0
-"""Between two writes of what the control plane said: mappings may change several times a second, flash wears out."""
+"""Interval between two writes of the last messages: mappings may change several times a second, and flash wears out."""
 
 RETRY_S = 10.0
-"""From a failed writing to the next attempt: a disk that is full is so for a while."""
+"""Interval from a failed write to the next attempt: a full disk stays full for a while."""
 
 T = TypeVar("T")
 
@@ -83,18 +83,18 @@ class StateDirError(OSError):
 class StateStore:
     """One sidecar's folder, locked while open. Raises StateDirError when it cannot be used.
 
-    `identity` is new in every run: same token, larger incarnation.
+    `identity` has the same token in every run, but a larger incarnation.
     """
 
     def __init__(self, folder: Path, owner: NodeName) -> None:
         self._owner = owner
         self.failures: Counter[str] = Counter()
-        """Files not read or not written."""
+        """Counts of files not read or not written, by failure."""
         self._folder, self._lock = _lock(folder)
         self._dirty: dict[str, bytes | LastGood] = {}
-        """What to write, by file."""
+        """Content to write, by file."""
         self._failing: set[str] = set()
-        """Files whose last writing failed, and was logged."""
+        """Files whose last write failed and was logged."""
         self.identity = self._next_identity()
         self._current = self._read(LAST_GOOD_FILE, lambda data: decode_last_good(data, owner)) or LastGood(owner)
         self.last_good = self._current
@@ -110,7 +110,7 @@ class StateStore:
         self._writer.start()
 
     def remember(self, message: ControlMessage) -> None:
-        """Keep a message that is in force now, in place of the last one of its kind; returns at once."""
+        """Keep a message that is in force now in place of the last one of its kind; return at once."""
         with self._condition:
             changed = self._current.with_message(message)
             if changed != self._current:
@@ -119,30 +119,30 @@ class StateStore:
                 self._condition.notify()
 
     def control_addresses(self, names: tuple[str, ...]) -> tuple[Address, ...]:
-        """Where a control plane of these names let us in, the newest first."""
+        """Return the addresses where a control plane of these names accepted us, newest first."""
         return self._addresses.addresses if self._addresses.names == names else ()
 
     def remember_addresses(self, names: tuple[str, ...], addresses: tuple[Address, ...]) -> None:
-        """Keep where a control plane of these names let us in; returns at once."""
+        """Keep the addresses where a control plane of these names accepted us; return at once."""
         with self._condition:
             self._addresses = ControlAddresses(names, addresses)
             self._dirty[ADDRESSES_FILE] = encode_addresses(self._addresses)
             self._condition.notify()
 
     def remember_revocations(self, pem: bytes) -> None:
-        """Keep the revocation lists that are in use; returns at once."""
+        """Keep the revocation lists in use; return at once."""
         with self._condition:
             self._dirty[REVOCATIONS_FILE] = encode_revocations(pem)
             self._condition.notify()
 
     def remember_clock_floor(self, floor: float) -> None:
-        """Keep the time (s since 1970) before which the clock is not believed; returns at once."""
+        """Keep the time (s since 1970) before which the clock is not believed; return at once."""
         with self._condition:
             self._dirty[CLOCK_FILE] = encode_clock_floor(floor)
             self._condition.notify()
 
     def close(self) -> None:
-        """Write what is not written yet, and let the folder go."""
+        """Write what is not written yet, and release the folder."""
         with self._condition:
             self._closing = True
             self._condition.notify()
@@ -155,7 +155,7 @@ class StateStore:
 
     def _next_identity(self) -> Identity:
         known = self._read(IDENTITY_FILE, decode_identity)
-        # Milliseconds since 1970 let the number grow even where the last one could not be read or written.
+        # Milliseconds since 1970 make the number grow even if the last one could not be read or written.
         incarnation = max(known.incarnation + 1 if known else 1, int(time.time() * 1000.0))
         identity = Identity(known.token if known else secrets.token_bytes(TOKEN_BYTES), incarnation)
         data = encode_identity(identity)
@@ -179,7 +179,7 @@ class StateStore:
             with self._condition:
                 if closing and failed:
                     return
-                # What came meanwhile is newer.
+                # What arrived meanwhile is newer.
                 self._dirty = failed | self._dirty
                 self._condition.wait_for(lambda: self._closing, RETRY_S if failed else MIN_WRITE_INTERVAL_S)
 
@@ -222,9 +222,9 @@ class StateStore:
 
 
 def peek_last_good(folder: Path, owner: NodeName) -> LastGood:
-    """Return what the control plane said last, as the files tell while a sidecar may be using them; nothing is changed.
+    """Return what the control plane said last, from files that a sidecar may be using; change nothing.
 
-    It is empty where there is none that this user can read. Files are replaced whole, so that none is found half done.
+    It is empty if this user can read none. Files are replaced whole, so none is ever half written.
     """
     try:
         with open_regular(folder / LAST_GOOD_FILE) as file:
@@ -235,7 +235,7 @@ def peek_last_good(folder: Path, owner: NodeName) -> LastGood:
 
 
 def _lock(path: Path) -> tuple[OwnFolder, int]:
-    """Open the folder, and keep a second sidecar out of it for as long as the returned descriptor is open."""
+    """Open the folder, and keep a second sidecar out of it while the returned descriptor is open."""
     try:
         folder = OwnFolder(path)
     except OSError as error:
@@ -262,5 +262,5 @@ def _open_lock(folder: OwnFolder) -> int:
     try:
         return folder.open(LOCK_FILE, os.O_RDWR | os.O_CREAT)
     except OSError:
-        # A card that has gone read-only still holds the last mapping: the lock of an earlier run will do.
+        # A card that has become read-only still holds the last mapping: the lock of an earlier run will do.
         return folder.open(LOCK_FILE, os.O_RDONLY)
