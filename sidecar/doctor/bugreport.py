@@ -49,7 +49,7 @@ if TYPE_CHECKING:
 EXIT_OK = 0
 EXIT_FAILURE = 1
 MAX_PART_BYTES = 8 << 20
-"""Of each file; a longer one loses its middle."""
+"""Limit of each file; a longer one loses its middle."""
 COMMAND_S = 15.0
 METRICS_S = 5.0
 JOURNAL_LINES = 2000
@@ -73,7 +73,7 @@ SYSCTLS = ("net/ipv4/conf/*/rp_filter", "net/ipv4/conf/*/arp_ignore", "net/core/
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run `plr bugreport`; returns its exit code."""
+    """Run `plr bugreport` and return its exit code."""
     parser = parser_of("plr bugreport", __doc__)
     parser.add_argument("--output", type=Path, metavar="FILE", help="default: plr-bugreport-NAME-TIME.tar.gz here")
     options = parser.parse_args(arguments)
@@ -92,7 +92,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def write(output: Path, stem: str, seen: Examination, where: Where) -> None:
-    """Write the tar, for nobody but this user to read; raises OSError."""
+    """Write the tar file, readable by this user only; raises OSError."""
     descriptor = os.open(output, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600)
     try:
         with open(descriptor, "wb") as file, tarfile.open(fileobj=file, mode="w:gz") as tar:
@@ -107,7 +107,7 @@ def write(output: Path, stem: str, seen: Examination, where: Where) -> None:
 
 
 def parts(seen: Examination, where: Where) -> Iterator[tuple[str, str]]:
-    """Yield name and text of each file, without secrets; what cannot be had says why."""
+    """Yield name and text of each file, without secrets; an unavailable part says why."""
     yield "doctor.txt", _free(as_text(seen.findings))
     yield "doctor.json", json.dumps(scrubbed_value(json.loads(as_json(seen))), indent=2)
     yield "configuration.yaml", _configuration(where.config, seen.config)
@@ -119,7 +119,7 @@ def parts(seen: Examination, where: Where) -> Iterator[tuple[str, str]]:
 
 
 def _free(text: str) -> str:
-    """Free text without secrets, of MAX_PART_BYTES and a line at most."""
+    """Return free text without secrets, of at most MAX_PART_BYTES and a line."""
     return scrubbed(_shortened(text))
 
 
@@ -131,8 +131,10 @@ def _shortened(text: str) -> str:
 
 
 def _configuration(path: Path, config: SidecarConfig | None) -> str:
-    """The configuration's known keys with their values, which are checked. Of one that is wrong the known keys alone:
-    what else stands there may be anything."""
+    """Return the configuration's known keys with their checked values.
+
+    Of a wrong configuration, return the known keys only: anything else in it may be a secret.
+    """
     if config is not None:
         return yaml.safe_dump(scrubbed_value(config.model_dump(mode="json", warnings=False)), sort_keys=False)
     try:
@@ -151,7 +153,7 @@ def _versions() -> str:
         lines += [f"system {platform.freedesktop_os_release().get('PRETTY_NAME', 'unknown')}"]
     except OSError:
         lines += ["system unknown"]
-    # By itself: as part of the version it may be long enough to be taken for a key.
+    # On its own line: as part of the version it may be long enough to be taken for a key.
     lines += [f"commit {commit.commit() or 'not known'}"]
     for package in PACKAGES:
         try:
@@ -203,10 +205,10 @@ def _metrics(seen: Examination) -> str:
 
 
 def _answer(host: str, port: int, until: float) -> bytes:
-    """Return what is answered; raises OSError, also when there is no end of it at `until` (monotonic seconds).
+    """Return the answer; raise OSError, also if it has not ended by `until` (monotonic seconds).
 
-    An HTTP library's time limit is for each read alone, and any user may have taken the port of a sidecar that is down,
-    to answer a byte at a time.
+    The timeout of an HTTP library is for each single read, and any user may have taken the port of a sidecar that is
+    down, to answer a byte at a time.
     """
     data = bytearray()
     with socket.create_connection((host, port), METRICS_S) as sock:

@@ -34,7 +34,7 @@ EXIT_FAILURE = 1
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run `plr doctor`; returns its exit code."""
+    """Run `plr doctor` and return its exit code."""
     parser = parser_of("plr doctor", __doc__)
     parser.add_argument("--json", action="store_true", help="print findings and the sidecar's state as JSON")
     parser.add_argument("--no-ping", action="store_true", help="do not ping the paths")
@@ -45,7 +45,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def as_text(findings: Iterable[Finding]) -> str:
-    """Return a line for each finding, and one that counts them."""
+    """Return a line for each finding, and a last one that counts them."""
     findings = list(findings)
     width = max((len(one.check) for one in findings), default=0)
     lines = []
@@ -58,7 +58,7 @@ def as_text(findings: Iterable[Finding]) -> str:
 
 
 def as_json(seen: Examination) -> str:
-    """Return the findings, and the state of the running sidecar that they come from."""
+    """Return the findings as JSON, with the state of the running sidecar that they come from."""
     shown: dict[str, Any] = {
         "findings": [
             {"level": one.level.value, "check": one.check, "text": one.text, "do": one.remedy} for one in seen.findings

@@ -1,4 +1,4 @@
-"""Looks at a node: reads what the checks judge, asks the running sidecar, pings its paths."""
+"""Examines a node: reads what the checks judge, queries the running sidecar, pings its paths."""
 
 from __future__ import annotations
 
@@ -47,32 +47,32 @@ PING_EVERY_S = 0.2
 PING_BYTES = 64
 PING_PATIENCE_S = 2.0
 PINGING_S = 10.0
-"""All together, however many peers do not answer."""
+"""Limit for all pings together, however many peers do not answer."""
 MAX_PATHS_OF_AN_INTERFACE = 12
-"""Pinged: three times as many pings at once as an interface lets through."""
+"""Paths to ping: three times as many pings at once as an interface lets through."""
 
 
 @dataclass(slots=True)
 class Examination:
-    """What was found, and what it was found from."""
+    """The findings, and what they are based on."""
 
     findings: list[Finding] = field(default_factory=list)
     state: dict[str, Any] | None = None
-    """Of the running sidecar; None: it does not answer."""
+    """State of the running sidecar; None if it does not answer."""
     config: SidecarConfig | None = None
 
 
 @dataclass(frozen=True, slots=True)
 class Where:
-    """Which sidecar is meant."""
+    """Which sidecar to examine."""
 
     config: Path = DEFAULT_CONFIG
     socket: Path | None = None
-    """None: as the configuration says."""
+    """None: as configured."""
 
 
 def sockets(where: Where, config: SidecarConfig | None) -> list[Path]:
-    """Return where the sidecar's socket may be, the likelier first."""
+    """Return where the sidecar's socket may be, the likeliest path first."""
     if where.socket is not None:
         return [where.socket]
     if config is not None:
@@ -85,8 +85,10 @@ def sockets(where: Where, config: SidecarConfig | None) -> list[Path]:
 
 
 def _as_written(path: Path) -> tuple[str | None, Path]:
-    """Return local_socket and state_dir of a configuration that is wrong, or whose certificate this user may not read:
-    where the running sidecar is, it may tell all the same."""
+    """Return local_socket and state_dir of a configuration that is wrong, or whose certificate this user may not read.
+
+    It may still tell where the running sidecar is.
+    """
     try:
         data = parse_yaml(read_text(path), str(path))
     except ConfigError:
@@ -99,7 +101,7 @@ def _as_written(path: Path) -> tuple[str | None, Path]:
 
 
 def connect(where: Where, config: SidecarConfig | None) -> LocalClient:
-    """Return a connection to the running sidecar; raises LocalError, which says why there is none."""
+    """Return a connection to the running sidecar; raise LocalError, which says why there is none."""
     said: list[LocalError] = []
     for path in sockets(where, config):
         try:
@@ -109,14 +111,14 @@ def connect(where: Where, config: SidecarConfig | None) -> LocalClient:
     for one in said:
         if isinstance(one, LocalBusyError):
             raise one
-    # Not the first of two: a member of the group may not look into the state folder, wherever the sidecar is.
+    # The last error counts: a member of the group may not look into the state folder, wherever the sidecar is.
     if said and isinstance(said[-1], LocalRefusedError):
         raise said[-1]
     raise LocalError(" and ".join(map(str, said)) or "local_socket is null in the configuration")
 
 
 def _owners(config: Path) -> frozenset[int]:
-    """Whose sidecar it may be: who wrote the configuration says what is asked anyway."""
+    """Return the users whose sidecar it may be: the owner of the configuration decides what is queried anyway."""
     try:
         return frozenset({config.stat().st_uid})
     except (OSError, ValueError):
@@ -124,9 +126,10 @@ def _owners(config: Path) -> frozenset[int]:
 
 
 def read_config(where: Where, told: Mapping[str, Any] | None = None) -> SidecarConfig:
-    """Read the configuration; raises ConfigError.
+    """Read the configuration; raise ConfigError.
 
-    `told` is the running sidecar's part `node`: its name and role where the certificate is not for this user to read.
+    `told` is the `node` part of the running sidecar's state: its name and role, if this user may not read the
+    certificate.
     """
 
     def identify(folder: Path) -> Identity:
@@ -142,7 +145,7 @@ def read_config(where: Where, told: Mapping[str, Any] | None = None) -> SidecarC
 
 
 def examine(where: Where, *, pinging: bool = True) -> Examination:
-    """Look at everything; takes some seconds, most of them for pings."""
+    """Examine everything; this takes some seconds, most of them for pings."""
     seen = Examination()
     config, problem = _try_config(where, None)
     client = None
@@ -226,14 +229,14 @@ def _certificate_and_clock(
     if config is not None:
         floors.append(_read_state(config.state_dir / CLOCK_FILE, decode_clock_floor) or 0.0)
     if files is not None:
-        # As a sidecar does when it starts: what the CA has signed is no later than now.
+        # As a starting sidecar does: the time of anything that the CA has signed is no later than now.
         floors.append(files.identity.not_before)
         floors += [one.signed_at for one in files.trust.lists().values() if one is not None]
     yield from node_checks.clock(now_wall, max(floors), host.clock_state())
 
 
 def _is_for_others(error: ConfigError) -> bool:
-    """Whether a file is not for this user to read; the sidecar's user may."""
+    """Return whether this user may not read a file; the sidecar's user may."""
     cause: BaseException | None = error
     while cause is not None and not isinstance(cause, PermissionError):
         cause = cause.__cause__
@@ -241,7 +244,7 @@ def _is_for_others(error: ConfigError) -> bool:
 
 
 def _read_state(path: Path, decode: Callable[[bytes], T]) -> T | None:
-    """Return what a file of the state folder holds, if it is there, for this user to read, and good."""
+    """Return the content of a file of the state folder if it exists, is readable for this user, and is valid."""
     try:
         return decode(read_regular(path, MAX_FILE_BYTES))
     except (OSError, DecodeError):
@@ -251,7 +254,7 @@ def _read_state(path: Path, decode: Callable[[bytes], T]) -> T | None:
 def _ros(where: Where, config: SidecarConfig | None, state: dict[str, Any] | None) -> Iterator[Finding]:
     shell = dict(os.environ)
     if state is not None:
-        # It has started, so its rclpy works; this shell's may be another.
+        # The sidecar has started, so its rclpy works; this shell may have a different one.
         used = node_checks.running_environment(state.get("node") or {}, shell)
         yield from node_checks.ros(used, shell, None)
         told = state.get("services") or {}
@@ -271,7 +274,7 @@ def _ros(where: Where, config: SidecarConfig | None, state: dict[str, Any] | Non
 
 
 def _types_last_offered(config: SidecarConfig) -> dict[str, str]:
-    """Types of the configured services that the peers of the last run offered."""
+    """Return the types of the configured services that the peers of the last run offered."""
     last = _read_state(config.state_dir / LAST_GOOD_FILE, lambda data: decode_last_good(data, config.node_name))
     if last is None or last.peers is None:
         return {}
@@ -328,7 +331,7 @@ def _judged(check: Callable[[dict[str, Any]], Iterator[Finding]], state: dict[st
 
 
 def _ping_all(client: LocalClient, state: dict[str, Any]) -> dict[PathKey, Pinged]:
-    """Ping the paths that are not down, some times each; of very many, some."""
+    """Ping the paths that are not down, PINGS times each; of very many, only some."""
     chosen: Counter[str] = Counter()
     pings: dict[PathKey, Pinged] = {}
     peers: dict[str, None] = {}
@@ -344,20 +347,20 @@ def _ping_all(client: LocalClient, state: dict[str, Any]) -> dict[PathKey, Pinge
             for peer in peers:
                 if time.monotonic() > end:
                     return pings
-                # It answers so many requests at once, and may take its time over some.
+                # The sidecar answers MAX_REQUESTS at once, and may take its time over some.
                 _listen(client, asked, pings, PING_PATIENCE_S, until=MAX_REQUESTS - 1)
                 asked[client.ping(peer, None, PING_BYTES)] = peer
             last = turn == PINGS - 1
             _listen(client, asked, pings, PING_PATIENCE_S if last else PING_EVERY_S, until=0 if last else -1)
     except LocalError:
-        pass  # what was answered until then is told
+        pass  # what was answered until then is reported
     return pings
 
 
 def _listen(
     client: LocalClient, asked: dict[int, str], pings: dict[PathKey, Pinged], patience_s: float, *, until: int
 ) -> None:
-    """Take what is answered, until no more than `until` requests are out."""
+    """Take answers until at most `until` requests are outstanding."""
     end = time.monotonic() + patience_s
     while len(asked) > until:
         line = client.next_line(end - time.monotonic())

@@ -1,4 +1,4 @@
-"""One line of what `plr doctor` finds."""
+"""Defines a finding: one line of the output of `plr doctor`."""
 
 from __future__ import annotations
 
@@ -7,11 +7,11 @@ from dataclasses import dataclass
 
 
 class Level(enum.Enum):
-    """How bad it is."""
+    """Severity of a finding."""
 
     OK = "ok"
     WARN = "warn"
-    """It works, or may: somebody should look."""
+    """It works, or may work, but somebody should look."""
     FAIL = "fail"
     """Something does not work."""
 
@@ -22,29 +22,29 @@ class Finding:
 
     level: Level
     check: str
-    """What was looked at: certificate, clock, ..."""
+    """Subject of the check: certificate, clock, ..."""
     text: str
     remedy: str = ""
     """What to do; empty with ok."""
 
 
 def ok(check: str, text: str) -> Finding:
-    """All is well."""
+    """Return a finding that all is well."""
     return Finding(Level.OK, check, text)
 
 
 def warn(check: str, text: str, remedy: str) -> Finding:
-    """Somebody should look."""
+    """Return a finding that somebody should look at."""
     return Finding(Level.WARN, check, text, remedy)
 
 
 def fail(check: str, text: str, remedy: str) -> Finding:
-    """Something does not work."""
+    """Return a finding that something does not work."""
     return Finding(Level.FAIL, check, text, remedy)
 
 
 def duration(seconds: float) -> str:
-    """Return a time as people say it: 3 s, 12 min, 5 h, 40 days."""
+    """Return a duration as people say it: 3 s, 12 min, 5 h, 40 days."""
     for unit, length in (("days", 86_400.0), ("h", 3600.0), ("min", 60.0)):
         if seconds >= 2 * length:
             return f"{seconds / length:.0f} {unit}"
@@ -57,5 +57,5 @@ def milliseconds(seconds: float) -> str:
 
 
 def share(part: float) -> str:
-    """Return a share in per cent, small ones with more digits."""
+    """Return a share in per cent; small ones get more digits."""
     return f"{part * 100:.3g} %"

@@ -1,4 +1,4 @@
-"""What is read of the host itself: kernel's clock, sysctls. No privileges are needed."""
+"""Reads the host itself: the kernel's clock, sysctls, the unit's environment. No privileges are needed."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 STA_UNSYNC = 0x0040
 CLOCK_KEPT_S = 16.0
-"""The kernel's bound of its error grows to this where nobody keeps the clock (ntp_adjtime(3): NTP_PHASE_LIMIT)."""
+"""The kernel's error bound grows to this if nothing disciplines the clock (ntp_adjtime(3): NTP_PHASE_LIMIT)."""
 ENVIRONMENT_FILE = "sidecar.env"
 MAX_ENVIRONMENT_BYTES = 1 << 16
 MAX_NAMES_CHARACTERS = 200
@@ -33,12 +33,12 @@ _TELLS_OF_ROS = frozenset(
         "ROS_STATIC_PEERS",
     }
 )
-"""Variables that name no file: PATH, PYTHONPATH, LD_PRELOAD, AMENT_PREFIX_PATH and many more run code."""
+"""Variables that name no file; PATH, PYTHONPATH, LD_PRELOAD, AMENT_PREFIX_PATH and many more can run code."""
 _PLAIN_VALUE = re.compile(r"[A-Za-z0-9_.:;, -]*")
 
 
 class _Timex(ctypes.Structure):
-    """The beginning of struct timex of adjtimex(2); the rest is room for what the kernel writes after it."""
+    """Start of struct timex of adjtimex(2); `rest` is room for what the kernel writes after it."""
 
     _fields_ = (
         ("modes", ctypes.c_uint),
@@ -53,15 +53,15 @@ class _Timex(ctypes.Structure):
 
 @dataclass(frozen=True, slots=True)
 class ClockState:
-    """What the kernel says of its clock."""
+    """What the kernel says about its clock."""
 
     synchronised: bool
     error_s: float
-    """At most so wrong, as whoever keeps it believes."""
+    """Maximum error, as estimated by the program that disciplines the clock."""
 
 
 def clock_state() -> ClockState | None:
-    """Ask the kernel whether somebody (chrony, systemd-timesyncd, ntpd) keeps its clock; None: it does not say."""
+    """Ask the kernel whether a program (chrony, systemd-timesyncd, ntpd) disciplines its clock; None: unknown."""
     timex = _Timex()
     try:
         answer = ctypes.CDLL(None, use_errno=True).adjtimex(ctypes.byref(timex))
@@ -88,18 +88,18 @@ def _number(path: Path) -> int | None:
 
 @dataclass(frozen=True, slots=True)
 class UnitEnvironment:
-    """The environment in which the unit of a configuration in /etc starts, as far as its files tell."""
+    """The environment in which the unit of a configuration in /etc starts, as far as its files show."""
 
     variables: dict[str, str]
     refused: str = ""
-    """What of `sidecar.env` is not used, and why; empty: nothing."""
+    """Parts of `sidecar.env` that are not used, and why; empty if all are used."""
 
 
 def unit_environment(config: Path) -> UnitEnvironment:
-    """Read `sidecar.env` beside the configuration, which wins over this shell's environment.
+    """Read `sidecar.env` beside the configuration; it overrides this shell's environment.
 
-    A program is run with it, so it is used only if nobody can have written it but root, this user, or the owner of the
-    configuration. The last one's tells of ROS and no more, since it must not run code of his as this user.
+    A program is run with it, so it is used only if nobody but root, this user, or the configuration's owner can have
+    written it. From the last, only plain ROS settings are taken: the owner must not run code as this user.
     """
     environment = dict(os.environ)
     path = config.with_name(ENVIRONMENT_FILE)
@@ -127,7 +127,7 @@ def unit_environment(config: Path) -> UnitEnvironment:
 
 
 def _read_trusted(path: Path, owners: Container[int]) -> tuple[int, str]:
-    """Return owner and text of a file that only `owners` can have written; raises OSError or ValueError."""
+    """Return owner and text of a file that only `owners` can have written; raise OSError or ValueError."""
     folder = os.open(path.parent, os.O_PATH | os.O_DIRECTORY | os.O_CLOEXEC)
     try:
         with open_regular(Path(path.name), folder=folder) as file:

@@ -1,4 +1,4 @@
-"""What can be judged of a node without its sidecar: certificate, clock, ROS, interfaces. Pure: all is given."""
+"""Judges what a node shows without its sidecar: certificate, clock, ROS, interfaces. Pure: all input is passed in."""
 
 from __future__ import annotations
 
@@ -37,13 +37,13 @@ def certificate(files: TlsFiles, now_wall: float) -> Iterator[Finding]:
 
 
 def files_on_disk(files: TlsFiles | None, broken: str | None, used: Mapping[str, Any]) -> Iterator[Finding]:
-    """Judge whether the files on the disk are those that a running sidecar tells of in `used`.
+    """Judge whether the files on disk are those that a running sidecar reports in `used`.
 
-    `broken`: why they cannot be had. Both None: they are not for this user, and the sidecar's word counts.
+    `broken` says why they cannot be read. If both are None, this user may not read them, and the sidecar's word counts.
     """
     refused = used.get("refused")
     if broken is None and refused:
-        # Perhaps only it: they may be for others than its user.
+        # Perhaps only the sidecar refuses them: they may be readable for other users than its own.
         text, _, remedy = str(refused.get("text")).partition("; ")
         if refused.get("start"):
             yield warn("certificate", f"{text}; the sidecar goes on with what it has", remedy)
@@ -66,7 +66,7 @@ def files_on_disk(files: TlsFiles | None, broken: str | None, used: Mapping[str,
 
 
 def certificate_in_use(used: Mapping[str, Any], now_wall: float) -> Iterator[Finding]:
-    """Judge the certificate that a running sidecar tells of, where its files are not for this user."""
+    """Judge the certificate that a running sidecar reports, where this user may not read its files."""
     problem = used.get("problem")
     if problem:
         text, _, remedy = str(problem.get("text")).partition("; ")
@@ -90,7 +90,7 @@ def _left(identity: Identity, now_wall: float) -> str:
 
 
 def clock(now_wall: float, floor: float, state: ClockState | None) -> Iterator[Finding]:
-    """Judge the host's clock against the newest time that the CA has signed (`floor`; 0: none known) and by NTP."""
+    """Judge the host's clock by the newest time that the CA has signed (`floor`; 0: none known) and by NTP."""
     set_it = "set it: timedatectl set-ntp true, or date -s"
     if now_wall < floor - SLACK_S:
         yield fail("clock", f"behind what the CA has signed, by {duration(floor - now_wall)} at least", set_it)
@@ -134,7 +134,7 @@ def ros(environment: Mapping[str, str], shell: Mapping[str, str], problem: str |
 
 
 def types(wanted: Mapping[str, str], missing: Mapping[str, str]) -> Iterator[Finding]:
-    """Judge the types of services, by name; `missing` are those that this environment does not have."""
+    """Judge the types of services by name; `missing` holds those that this environment lacks."""
     for name, kind in sorted(missing.items()):
         package = kind.partition("/")[0]
         yield fail(
@@ -148,7 +148,7 @@ def types(wanted: Mapping[str, str], missing: Mapping[str, str]) -> Iterator[Fin
 
 
 def interfaces(choice: InterfaceChoice) -> Iterator[Finding]:
-    """Judge what is configured against what is there."""
+    """Compare the configured interfaces with those that exist."""
     for one in choice.usable:
         routed = sorted({family for family, _ in one.gateways})
         routes = "default route over " + " and ".join(f"IPv{family}" for family in routed) if routed else ""
@@ -179,7 +179,7 @@ def interfaces(choice: InterfaceChoice) -> Iterator[Finding]:
 
 
 def reverse_path(filters: Mapping[str, int | None]) -> Iterator[Finding]:
-    """Judge `rp_filter` as it is in force on each interface that is used."""
+    """Judge the `rp_filter` in force on each interface in use."""
     strict = sorted(name for name, value in filters.items() if value == STRICT)
     if strict and len(filters) > 1:
         yield warn(
@@ -195,6 +195,6 @@ def reverse_path(filters: Mapping[str, int | None]) -> Iterator[Finding]:
 
 
 def running_environment(node: Mapping[str, Any], shell: Mapping[str, str]) -> dict[str, str]:
-    """Return the environment of the running sidecar, as far as it tells."""
+    """Return the environment of the running sidecar as it reports it, or else that of this shell."""
     told = node.get("environment")
     return {str(key): str(value) for key, value in told.items()} if isinstance(told, dict) else dict(shell)

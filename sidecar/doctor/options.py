@@ -1,4 +1,4 @@
-"""Command lines of what `plr` does on a node."""
+"""Parses the options common to the commands that `plr` runs on a node."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from sidecar.doctor.examination import DEFAULT_CONFIG, Where
 
 
 def parser_of(program: str, about: str | None) -> argparse.ArgumentParser:
-    """Return a parser that knows which sidecar is meant; `about` is a module's docstring."""
+    """Return a parser with the options that select a sidecar; `about` is a module's docstring."""
     summary, _, epilog = (about or "").partition("\n\n")
     parser = OneLineParser(
         prog=program,
@@ -27,5 +27,5 @@ def parser_of(program: str, about: str | None) -> argparse.ArgumentParser:
 
 
 def where_of(options: argparse.Namespace) -> Where:
-    """Return which sidecar the options mean."""
+    """Return which sidecar the options select."""
     return Where(options.config, options.socket)

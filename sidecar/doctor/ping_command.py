@@ -44,30 +44,30 @@ if TYPE_CHECKING:
 EXIT_OK = 0
 EXIT_NO_ANSWER = 1
 LEAST_INTERVAL_S = 0.1
-"""The sidecar sends 20 pings a second over an interface, at most."""
+"""The sidecar sends at most 20 pings a second over an interface."""
 DEFAULT_BYTES = 64
 MAX_INTERFACE_CHARACTERS = 15
-"""Linux' limit."""
+"""Linux's limit."""
 MAX_PATHS = 4096
-"""To one peer: more are not counted."""
+"""Paths to one peer; more are not counted."""
 MAX_WAITING = 128
-"""Turns of which answers are waited for."""
+"""Turns whose answers are awaited."""
 
 
 @dataclass(slots=True)
 class PathTally:
-    """What came of the pings over one path."""
+    """Results of the pings over one path."""
 
     asked: int = 0
     rtts_s: list[float] = field(default_factory=list)
     unsent: int = 0
-    """Of those asked for: those that did not leave, for a reason that was told. They are not lost."""
+    """Requested pings that did not leave, for a reported reason. They do not count as lost."""
     waiting: set[int] = field(default_factory=set)
-    """Turns that nothing was told of yet, the last ones."""
+    """The latest turns without any result yet."""
 
     @property
     def sent(self) -> int:
-        """How many left, as far as is known."""
+        """Number of pings that left, as far as is known."""
         return self.asked - self.unsent
 
     def line(self) -> str:
@@ -84,30 +84,30 @@ class PathTally:
 
 
 def quantile(ordered: Sequence[float], part: float) -> float:
-    """Return the smallest value that at least this part of the values does not exceed; they are sorted, and some."""
+    """Return the smallest value that at least this part of the values do not exceed; they are sorted and not empty."""
     return ordered[max(0, math.ceil(part * len(ordered)) - 1)]
 
 
 class Pinger:
-    """Sends rounds of pings to one peer, and says what comes."""
+    """Sends rounds of pings to one peer, and prints the results."""
 
     def __init__(
         self, client: LocalClient, peer: str, interface: str | None, size: int, say: Callable[[str], None]
     ) -> None:
         self.tallies: dict[tuple[str, int], PathTally] = {}
-        """By interface and number of the peer's interface."""
+        """Results by interface and number of the peer's interface."""
         self._client = client
         self._peer = peer
         self._interface = interface
         self._size = size
         self._say = say
         self.refused = 0
-        """Requests that the sidecar did not take: it had others to answer."""
+        """Requests that the sidecar refused, as it had others to answer."""
         self._rounds: dict[int, int] = {}
-        """Turn of each request that is out."""
+        """Turn of each outstanding request."""
 
     def run(self, count: int | None, interval_s: float, wait_s: float) -> None:
-        """Ping `count` times (None: for ever); raises LocalError."""
+        """Ping `count` times (None: forever); raises LocalError."""
         turn = 0
         next_at = time.monotonic()
         while count is None or turn < count:
@@ -165,13 +165,13 @@ class Pinger:
             self._say(f"{name}: seq={turn} time={pong['rtt_s'] * 1000:.2f} ms")
 
     def name(self, interface: str, remote: int) -> str:
-        """Return what a path is called; the peer's interface is numbered where it has several."""
+        """Return the name of a path; the peer's interface is numbered if it has several."""
         several = len({other for _, other in self.tallies}) > 1
         return f"{interface} to {self._peer}" + (f" (its interface {remote})" if several else "")
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run `plr ping`; returns its exit code."""
+    """Run `plr ping` and return its exit code."""
     parser = parser_of("plr ping", __doc__)
     parser.add_argument("peer", type=checked(node_name), metavar="PEER", help="a node's name, as plr doctor shows it")
     parser.add_argument("-c", "--count", type=whole(1, 1_000_000), metavar="N", help="stop after so many")
@@ -214,7 +214,7 @@ def _connect(where: Where) -> LocalClient:
         try:
             config = read_config(where)
         except ConfigError:
-            # Not for this user to read, or changed since the start: the usual socket may do.
+            # This user may not read it, or it changed since the start: the usual socket may do.
             config = None
     return connect(where, config)
 

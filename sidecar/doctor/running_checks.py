@@ -1,6 +1,6 @@
-"""What a running sidecar's state says: STUN, MTU, paths, mapping, control stream. Pure.
+"""Judges a running sidecar's state: STUN, MTU, paths, mapping, control stream. Pure.
 
-A state is what `LocalClient.state` returns. It may come from a sidecar of another version: what is missing is left out.
+`LocalClient.state` returns a state. It may come from a sidecar of another version: missing parts are left out.
 """
 
 from __future__ import annotations
@@ -21,35 +21,35 @@ if TYPE_CHECKING:
 State = dict[str, Any]
 
 STUN_FRESH_S = 60.0
-"""A mapping is asked for every 15 s or so; older than this, several answers in a row are missing."""
+"""STUN asks for a mapping about every 15 s; if it is older than this, several answers in a row are missing."""
 SEARCHED_S = 60.0
-"""After so long the search for a path's MTU is over."""
+"""The search for a path's MTU is over after this long."""
 STARTED_S = 20.0
-"""Peers are told, and probed, within this."""
+"""Peers are known and probed within this time after the start."""
 MAX_GONE = 8
-"""Lines about nodes that are no peers any more."""
+"""Lines about nodes that are no longer peers."""
 GOODBYE = "peer closed"
-"""Why a path went down to a node that ended as it should."""
+"""Reason for a path going down when its node ended in order."""
 LOSSY = 0.05
-"""Of datagrams; more is worth a line."""
+"""Loss rate of datagrams above which a path gets a warning."""
 HOPELESS = 0.5
-"""Of a service without a target: a larger prediction of misses is worth a warning."""
+"""Predicted misses above which a service without a target gets a warning."""
 SHARED_ADDRESSES = ip_network("100.64.0.0/10")
-"""RFC 6598: behind a carrier's NAT."""
+"""RFC 6598: addresses behind a carrier's NAT."""
 
 
 @dataclass(slots=True)
 class Pinged:
-    """What came of the pings over one path."""
+    """Results of the pings over one path."""
 
     rtts_s: list[float] = field(default_factory=list)
     sent: int = 0
-    """Those that left, as far as is known."""
+    """Number of pings that left, as far as is known."""
     problem: str = ""
     """Why the last one did not leave."""
 
     def take(self, rtt_s: float, problem: str) -> None:
-        """Note an answer; with a problem: that one of them did not leave, and so is not lost."""
+        """Note an answer; or, with a problem, that a ping did not leave and so is not lost."""
         if problem:
             self.problem = problem
             self.sent -= 1
@@ -58,11 +58,11 @@ class Pinged:
 
 
 PathKey = tuple[str, str, int]
-"""Interface, peer, number of the peer's interface."""
+"""(interface, peer, number of the peer's interface)"""
 
 
 def node(state: State, expected: str | None) -> Iterator[Finding]:
-    """Say what runs; `expected` is the name in the configuration, if that could be read."""
+    """Report which sidecar runs; `expected` is the name in the configuration, if that could be read."""
     told = state.get("node") or {}
     name = told.get("name")
     if expected is not None and name != expected:
@@ -142,7 +142,7 @@ def _shown(host: str, port: int) -> str:
 
 
 def devices(state: State) -> Iterator[Finding]:
-    """Say what is odd about the sockets and drivers of interfaces."""
+    """Report oddities of the sockets and drivers of interfaces."""
     for interface in state["interfaces"]:
         if interface.get("bound_to") == "address":
             yield warn(
@@ -158,7 +158,7 @@ def devices(state: State) -> Iterator[Finding]:
 
 
 def mtu(state: State) -> Iterator[Finding]:
-    """Compare what paths carry with what their interfaces take."""
+    """Compare what the paths carry with what their interfaces take."""
     takes = {interface["name"]: interface["mtu"] for interface in state["interfaces"]}
     for name, paths in sorted(_by(state["paths"], lambda path: path["interface"]).items()):
         carried: dict[int, int] = {}
@@ -189,7 +189,7 @@ def _is_stuck(path: Mapping[str, Any]) -> bool:
 
 
 def paths(state: State, pings: Mapping[PathKey, Pinged]) -> Iterator[Finding]:
-    """Judge each path; of what is down, say whom to blame: an interface, a peer, or the path itself."""
+    """Judge each path; for paths that are down, name what to blame: an interface, a peer, or the path itself."""
     by_interface = _by(state["paths"], lambda path: path["interface"])
     by_peer = _by(state["paths"], lambda path: path["peer"])
     dark_interfaces = {name for name, ones in by_interface.items() if all(_is_down(one) for one in ones)}
@@ -222,14 +222,14 @@ def paths(state: State, pings: Mapping[PathKey, Pinged]) -> Iterator[Finding]:
     told = {(path["interface"], path["peer"]) for path in state["paths"] if not _is_down(path)}
     for path in sorted(state["paths"], key=lambda one: (one["peer"], one["interface"], one["remote"])):
         blamed = path["interface"] in dark_interfaces or path["peer"] in dark_peers
-        # A peer's further interface that is not reached from here (IPv6 of its own, an inner network) is nothing odd.
+        # It is normal that a further interface of a peer (IPv6-only, an inner network) is not reached from here.
         if _is_down(path) and (blamed or (path["interface"], path["peer"]) in told):
             continue
         yield _path(path, pings.get((path["interface"], path["peer"], path["remote"])))
 
 
 def gone(state: State) -> Iterator[Finding]:
-    """Say who was a peer a while ago and is none: just these are missing in everything else."""
+    """Report nodes that were peers a while ago but are no longer: they are missing from all other checks."""
     now = {path["peer"] for path in state["paths"]}
     left = {
         peer: ones for peer, ones in _by(state.get("gone") or (), lambda one: one["peer"]).items() if peer not in now
@@ -306,7 +306,7 @@ def _by(ones: Sequence[dict[str, Any]], key: Callable[[dict[str, Any]], str]) ->
 
 
 def services(state: State) -> Iterator[Finding]:
-    """Judge what is carried."""
+    """Judge the services that are carried."""
     told = state.get("services") or {}
     node = state.get("node") or {}
     robot = node.get("role") == "robot"
@@ -340,14 +340,14 @@ def services(state: State) -> Iterator[Finding]:
 def _domain(node: Mapping[str, Any]) -> tuple[str, str]:
     """Return in which ROS domain a cloud looks for servers, and what to do if it finds none."""
     domain = "ROS_DOMAIN_ID"
-    told = node.get("environment")  # one of an earlier version does not tell
+    told = node.get("environment")  # an earlier version does not report it
     shown = f", {domain} {told.get(domain) or '0'}" if isinstance(told, dict) else ""
     remedy = f"compare the names (plr status), and the {domain} that the server was started with"
     return f"a node of this host's ROS domain{shown}", remedy
 
 
 def mapping(state: State, targets: Callable[[str], float | None]) -> Iterator[Finding]:
-    """Judge what is mapped (robots); `targets` tells the largest share of misses that a service may have."""
+    """Judge a robot's mapping; `targets` returns the largest share of misses that a service may have."""
     if (state.get("node") or {}).get("role") != "robot":
         return
     told = state.get("mapping") or {}

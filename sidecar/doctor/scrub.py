@@ -1,9 +1,9 @@
-"""Takes secrets out of text that leaves a node. Pure.
+"""Removes secrets from text that leaves a node. Pure.
 
-Nothing that holds secrets is collected in the first place, and of a configuration only what is known; this is for free
-text: a passphrase on a command line in the journal, a key in an error. It leaves out too much rather than too little:
-the rest of a line after a word such as password, and whatever long string consists of more than words and numbers.
-Time grows with the text's length, whatever is in it.
+Nothing that holds secrets is collected in the first place, and only the known keys of a configuration. This is for free
+text: a passphrase on a command line in the journal, a key in an error. It removes too much rather than too little: the
+rest of a line after a word such as password, and any long string of more than words and numbers. Time grows with the
+length of the text, whatever its content.
 """
 
 from __future__ import annotations
@@ -13,9 +13,9 @@ from typing import Any
 
 LEFT_OUT = "(left out)"
 MAX_LINE = 2000
-"""Characters: no line that helps is longer."""
+"""Maximum length of a line in characters; no useful line is longer."""
 MAX_VALUE_LINES = 100
-"""Of a secret in brackets or quotes."""
+"""Maximum number of lines of a secret in brackets or quotes."""
 
 _PEM = re.compile(r"-----BEGIN ([A-Z0-9 ]*)-----.*?(?:-----END \1-----|\Z)", re.DOTALL)
 _NAME = re.compile(
@@ -23,35 +23,35 @@ _NAME = re.compile(
     r"|private[-_ ]?key|(?-i:(?<=[a-z])Keys?)(?=\"?'?\s*[=:])"
     r"|(?<![a-z])(?:pwd|psk)(?![a-z])|-pass(?![a-z])|(?<![a-z])(?:pass|keys?)(?=\"?'?\s*[=:])"
 )
-"""What is called so is a secret, and may consist of several words; [a-z] is either case here."""
+"""A value with such a name is a secret, and may consist of several words; [a-z] matches either case here."""
 _NAME_GOES_ON = re.compile(r"[\w.-]*")
 _OPENS = re.compile(r"[=:>|\[{(\\]")
 _SAYS_SOMETHING = re.compile(r"[^\W_]")
 _REFUSED_VALUE = re.compile(r"\b(got) ['\"\[{].*")
-"""In the error of a configuration: the value may be a secret that stands at the wrong key."""
+"""A value in a configuration error, which may be a secret under the wrong key."""
 _USER_AND_SPACE = re.compile(r"://[^\s/@:]+:[^\s/@]*\s+@")
 _DASHES = re.compile(r"(?:- +)*")
 _NON_SPACE = re.compile(r"\S+")
 _HEX_PAIRS = re.compile(r"(?:[0-9A-Fa-f]{2}:){15,}[0-9A-Fa-f]{2}")
-"""A fingerprint or a key: longer than any address."""
+"""A fingerprint or a key, longer than any address."""
 _RUN = re.compile(r"[A-Za-z0-9+/_=-]{20,}")
-"""What keys and tokens are written in, as are paths and names."""
+"""The form of keys and tokens, but also of paths and names."""
 _SEPARATORS = re.compile(r"[+/_=-]+")
 _PLAIN = re.compile(
     r"[a-z]{0,24}\d{0,4}|[A-Z]{1,24}\d{0,4}|[a-z]{0,24}(?:[A-Z][a-z]{1,23}){0,8}\d{0,4}|\d{1,20}|\d{8}T\d{6}Z?"
 )
-"""A piece of a path or a name: a word, several ones in camel case, a number, a time."""
+"""A piece of a path or a name: a word, several words in camel case, a number, a time."""
 _SHORT = 5
 _MAX_ODD = 8
-"""Characters of short pieces that are no words: A1, x86."""
+"""Maximum number of characters in short pieces that are no words, such as A1 or x86."""
 
 
 def scrubbed(text: str) -> str:
-    """Return the text, with lines of MAX_LINE characters at most, without what is, or is called, a secret."""
+    """Return the text with lines of at most MAX_LINE characters, without anything that is or is called a secret."""
     text = _PEM.sub(lambda found: f"({found[1].strip() or 'PEM'} left out)", text)
     lines = []
     named_at = -1
-    """Where the name of a secret begins whose value comes, or goes on, in lines below it; -1: of none."""
+    """Column of the name of a secret whose value begins or continues in the lines below it; -1 if there is none."""
     is_first = False
     unclosed = _Unclosed()
     for whole in text.split("\n"):
@@ -62,8 +62,8 @@ def scrubbed(text: str) -> str:
             continue
         indent = len(line) - len(content)
         if named_at >= 0:
-            # The first line is the value, wherever it stands, as are those within a bracket, a quotation, or behind a
-            # backslash; further ones where they stand in it or in a list.
+            # The first line belongs to the value wherever it stands, and so do lines within a bracket or a quotation or
+            # after a backslash. Further lines belong to it if they are indented or in a list.
             within = unclosed.goes_on()
             if is_first or within or indent > named_at or (indent == named_at and content.startswith("-")):
                 is_first = False
@@ -74,18 +74,18 @@ def scrubbed(text: str) -> str:
         shown, value = _line(line)
         lines.append(shown)
         if value is not None:
-            # In a list the value's lines stand further in than the dash.
+            # In a list the value's lines are indented further than the dash.
             dashes = _DASHES.match(content)
             named_at = indent + (0 if dashes is None else dashes.end())
             unclosed = _Unclosed()
-            # The name's own quotation ends where it does.
+            # The quotation of the name itself ends with the name.
             unclosed.take(value.removeprefix('"'))
             is_first = _SAYS_SOMETHING.search(value) is None
     return "\n".join(lines)
 
 
 class _Unclosed:
-    """Whether a value goes on in the next line, by its brackets, double quotes and backslashes."""
+    """Tracks whether a value continues in the next line, by its brackets, double quotes and backslashes."""
 
     def __init__(self) -> None:
         self._depth = 0
@@ -94,19 +94,19 @@ class _Unclosed:
         self._lines = 0
 
     def take(self, text: str) -> None:
-        """A line of the value."""
+        """Take a line of the value."""
         self._lines += 1
         self._is_quoted ^= text.count('"') % 2 == 1
         self._depth += sum(map(text.count, "[({")) - sum(map(text.count, "])}"))
         self._goes_on = text.endswith("\\")
 
     def goes_on(self) -> bool:
-        """A bracket that nobody closes is no reason to leave out the rest of a report."""
+        """Return whether the value continues; a bracket that is never closed must not remove the rest of a report."""
         return self._lines <= MAX_VALUE_LINES and (self._goes_on or self._is_quoted or self._depth > 0)
 
 
 def _line(line: str) -> tuple[str, str | None]:
-    """Return a line without secrets, and the value of one that it names, or its beginning; None: it names none."""
+    """Return a line without secrets, and the (start of the) value of a secret that it names; None: it names none."""
     value = None
     named = _NAME.search(line)
     if named is not None:
@@ -139,7 +139,7 @@ def _only_words(run: re.Match[str]) -> str:
 
 
 def scrubbed_value(value: Any) -> Any:
-    """Return a value of YAML or JSON without what is, or is called, a secret, whatever stands there."""
+    """Return a value of YAML or JSON without anything that is or is called a secret."""
     if isinstance(value, dict):
         return {scrubbed(str(key)): _under(str(key), inner) for key, inner in value.items()}
     if isinstance(value, list | tuple):
