@@ -1,1 +1,1 @@
-"""The bottom of the contract: errors, histogram, size classes, versions. Imports nothing of ours."""
+"""Provides the base of the contract: errors, histogram, size classes, durations. Imports nothing of ours."""

@@ -1,4 +1,4 @@
-"""Errors that both planes raise."""
+"""Defines the errors that both planes raise."""
 
 from __future__ import annotations
 
@@ -6,17 +6,17 @@ from protos.base.printable import escaped
 
 
 class DecodeError(ValueError):
-    """Bytes or messages from the network break their format; the text tells which rule of it."""
+    """Bytes or messages from the network break their format; the text names the broken rule."""
 
 
 class UnknownKindError(DecodeError):
-    """A message of a kind that only a newer program knows: to be left out, and no reason to end anything."""
+    """A message is of a kind that only a newer program knows: it is ignored, and is no reason to end anything."""
 
 
 class ConfigError(ValueError):
     """A configuration is refused; the text is one line that names the file, the key and what was expected.
 
-    It is fit for a terminal: what is not printable, in a key of the file or in a path, is escaped.
+    It is safe for a terminal: unprintable characters in a key of the file or in a path are escaped.
     """
 
     def __init__(self, source: str, key: str, problem: str) -> None:
@@ -27,4 +27,4 @@ class ConfigError(ValueError):
 
 
 class StartError(ConfigError):
-    """A configuration that may be right cannot be had here and now, such as a port that somebody else has."""
+    """A configuration may be right but cannot be used here and now, such as a port that is taken."""

@@ -1,4 +1,4 @@
-"""Mergeable latency histogram with logarithmic buckets: the unit of every report.
+"""Implements a mergeable latency histogram with logarithmic buckets, the unit of every report.
 
 Layout 1::
 
@@ -8,12 +8,12 @@ Layout 1::
 
     beside the buckets: `lost`, requests that were never answered
 
-A value reported at the geometric middle of its bucket is off by less than 2 %. Histograms of the same layout
-merge by adding counts, which is exact and independent of the order; an earlier state of a histogram that only grew is
-subtracted as exactly. Old samples fade in `controlplane.core.estimate.fading`, where there is a clock to fade by.
+A value reported at the geometric middle of its bucket is off by less than 2 %. Histograms of the same layout merge by
+adding counts, which is exact and independent of the order. An earlier state of a histogram that only grew is subtracted
+just as exactly. Old samples fade in `controlplane.core.estimate.fading`, where there is a clock to fade by.
 
-A sidecar has no numpy of its own, and an operator's `plr` none at all: only what the control plane computes with
-imports it, at its first use.
+A sidecar has no numpy of its own, and an operator's `plr` has none at all. So only the parts that the control plane
+computes with import it, at their first use.
 """
 
 from __future__ import annotations
@@ -35,16 +35,16 @@ if TYPE_CHECKING:
     from numpy.typing import ArrayLike, NDArray
 
 LAYOUT = 1
-"""Number of the bucket layout above; another layout gets another number, never this one changed."""
+"""Number of the bucket layout above; any other layout gets another number."""
 
 MIN_S = 1e-4
-"""Lower edge of the first regular bucket, seconds: below what a request over any network takes."""
+"""Lower edge of the first regular bucket in seconds, below what a request takes over any network."""
 
 MAX_S = 60.0
-"""Upper edge of the last regular bucket, seconds: beyond every deadline that makes sense for a robot."""
+"""Upper edge of the last regular bucket in seconds, beyond any sensible deadline of a robot."""
 
 REGULAR_BUCKETS = 340
-"""The fewest that keep the error below 2 % between MIN_S and MAX_S."""
+"""The smallest number that keeps the error below 2 % between MIN_S and MAX_S."""
 
 GROWTH = (MAX_S / MIN_S) ** (1.0 / REGULAR_BUCKETS)
 """Ratio of a regular bucket's upper edge to its lower one."""
@@ -53,7 +53,7 @@ EDGES: tuple[float, ...] = (
     *(MIN_S * GROWTH**i for i in range(REGULAR_BUCKETS)),
     MAX_S,
 )
-"""The edges between buckets, seconds: bucket i ends at EDGES[i], and the last has no end."""
+"""The edges between buckets in seconds: bucket i ends at EDGES[i], and the last has no end."""
 
 BUCKETS = REGULAR_BUCKETS + 2
 """Regular buckets, underflow and overflow."""
@@ -63,20 +63,20 @@ MIDS: tuple[float, ...] = (
     *(math.sqrt(low * high) for low, high in itertools.pairwise(EDGES)),
     MAX_S,
 )
-"""The value that stands for a bucket, seconds: its geometric middle; for overflow its lower edge."""
+"""The value in seconds that represents a bucket: its geometric middle, or the lower edge of the overflow bucket."""
 
 _EMPTY = bytes(8 * BUCKETS)
 
 MAX_COUNT = 1 << 40
-"""Most samples of one histogram accepted from the network: more than any sidecar sends in a lifetime, and far from
-where a 64-bit sum or a float would lose it."""
+"""Most samples of one histogram accepted from the network: more than any sidecar sends in a lifetime, and far below
+where a 64-bit sum or a float would become inexact."""
 
 
 class Histogram:
-    """Counts of latencies by bucket; mutable, and for one thread at a time. Times are seconds.
+    """Counts of latencies by bucket; mutable, and for one thread at a time. Times are in seconds.
 
-    One that came over the network stays as sparse as it came until somebody asks for the buckets: a report has dozens,
-    each with a handful of samples.
+    A histogram from the network stays sparse until its buckets are needed: a report has dozens, each with a handful of
+    samples.
     """
 
     __slots__ = ("_counts", "_lost", "_sparse")
@@ -85,17 +85,17 @@ class Histogram:
     __hash__ = None  # type: ignore[assignment]  # Python's own way to say so
 
     def __init__(self) -> None:
-        # Of Python's integers in a row one is counted up twice as fast as in numpy, which computes on the same memory.
+        # An integer in an array is incremented twice as fast as in numpy, which computes on the same memory.
         self._counts = array("q", _EMPTY)
         self._lost = 0
-        # Tuples of numbers: unlike lists, the garbage collector passes them over.
+        # Tuples of numbers, as the garbage collector skips them, unlike lists.
         self._sparse: tuple[tuple[int, ...], tuple[int, ...]] | None = None
-        """The buckets in use and their counts, while `_counts` is not made yet."""
+        """The buckets in use and their counts, as long as `_counts` does not exist."""
 
     if not TYPE_CHECKING:
 
         def __getattr__(self, name: str) -> array[int]:
-            # Python asks here for a slot that is empty, so that `record` pays nothing for sparse ones.
+            # Python calls this for an empty slot, so that `record` pays nothing for sparse histograms.
             if name != "_counts":
                 raise AttributeError(name)
             counts = array("q", _EMPTY)
@@ -112,7 +112,7 @@ class Histogram:
         self._counts[bisect_right(EDGES, seconds)] += 1
 
     def record_many(self, seconds: ArrayLike) -> None:
-        """Count many answered requests, as `record` counts one; if one of them is NaN, none is."""
+        """Count many answered requests, as `record` counts one; if one of them is NaN, count none."""
         import numpy as np
 
         values = np.asarray(seconds, dtype=np.float64).ravel()
@@ -134,10 +134,10 @@ class Histogram:
         self._lost += other._lost
 
     def subtract(self, earlier: Histogram) -> None:
-        """Take away what was counted before: what is left came since.
+        """Subtract an earlier state, so that only later samples are left.
 
-        Raises ValueError, and leaves all as it was, if `earlier` counts more anywhere: then it is not this histogram's
-        past.
+        Raises ValueError and changes nothing if any count of `earlier` is larger: then it is no earlier state of this
+        histogram.
         """
         counts = self._counts
         if self._lost < earlier._lost or any(counts[index] < taken for index, taken in earlier._items()):
@@ -147,7 +147,7 @@ class Histogram:
         self._lost -= earlier._lost
 
     def copy(self) -> Histogram:
-        """A histogram of its own with the same counts."""
+        """Return a separate histogram with the same counts."""
         twin = Histogram()
         twin._counts = self._counts[:]
         twin._lost = self._lost
@@ -160,7 +160,7 @@ class Histogram:
         self._sparse = None
 
     def take(self) -> Histogram:
-        """What was recorded so far, and start anew."""
+        """Return what was recorded so far, and start again from zero."""
         taken = Histogram()
         taken._counts, taken._lost = self._counts, self._lost
         self.clear()
@@ -168,30 +168,30 @@ class Histogram:
 
     @property
     def counts(self) -> NDArray[np.int64]:
-        """Count of each bucket, `BUCKETS` of them: a view, which later records change."""
+        """Count of each of the `BUCKETS` buckets; a view, which later records change."""
         import numpy as np
 
         return np.frombuffer(self._counts, dtype=np.int64)
 
     @property
     def lost(self) -> int:
-        """Requests that were never answered."""
+        """Number of requests that were never answered."""
         return self._lost
 
     @property
     def answered(self) -> int:
-        """Requests that were answered, however late."""
+        """Number of requests that were answered, however late."""
         return sum(self._counts if self._sparse is None else self._sparse[1])
 
     @property
     def total(self) -> int:
-        """All requests, answered or lost."""
+        """Number of all requests, answered or lost."""
         return self.answered + self._lost
 
     def count_over(self, seconds: float) -> float:
-        """How many took longer than `seconds`, linear inside a bucket; the lost took longer than anything.
+        """Return how many requests took longer than `seconds`, linear inside a bucket; lost ones always count.
 
-        All of the overflow bucket counts as over: how far over it goes, it does not know.
+        The whole overflow bucket counts as over, as its values are not known.
         """
         index = bisect_right(EDGES, seconds)
         over = float(sum(self._counts[index + 1 :]) + self._lost)
@@ -202,14 +202,14 @@ class Histogram:
         return over + self._counts[index] * min(1.0, (high - seconds) / (high - low))
 
     def fraction_over(self, seconds: float) -> float:
-        """Share of all requests that took longer than `seconds`; NaN of an empty histogram."""
+        """Return the share of all requests that took longer than `seconds`; NaN for an empty histogram."""
         total = self.total
         return self.count_over(seconds) / total if total else math.nan
 
     def quantile(self, q: float) -> float:
-        """Latency that a share `q` of all requests does not exceed, within 2 %.
+        """Return the latency that a share `q` of all requests does not exceed, within 2 %.
 
-        inf where that many were not answered, `MAX_S` in the overflow bucket, NaN of an empty histogram.
+        It is inf where that many were not answered, `MAX_S` in the overflow bucket, and NaN for an empty histogram.
         Raises ValueError unless 0 <= q <= 1.
         """
         if not 0.0 <= q <= 1.0:
@@ -226,12 +226,12 @@ class Histogram:
         return math.inf
 
     def mean(self) -> float:
-        """Mean latency of the answered requests, within 2 %; NaN if there are none."""
+        """Return the mean latency of the answered requests, within 2 %; NaN if there are none."""
         answered = self.answered
         return self.sum_s() / answered if answered else math.nan
 
     def sum_s(self) -> float:
-        """Seconds of all answered requests together, within 2 %."""
+        """Return the total time of all answered requests in seconds, within 2 %."""
         return sum(count * MIDS[index] for index, count in self._items())
 
     @property
@@ -243,12 +243,12 @@ class Histogram:
         return used, [self._counts[index] for index in used]
 
     def to_sparse(self) -> tuple[list[int], list[int], int]:
-        """Indices of the buckets in use, ascending, their counts, and the lost."""
+        """Return the ascending indices of the buckets in use, their counts, and the lost."""
         indices, counts = self.sparse
         return list(indices), list(counts), self._lost
 
     def _items(self) -> Iterator[tuple[int, int]]:
-        """The buckets in use, ascending, with their counts."""
+        """Yield the buckets in use, ascending, with their counts."""
         if self._sparse is not None:
             return zip(*self._sparse, strict=True)
         return itertools.compress(enumerate(self._counts), self._counts)
@@ -257,7 +257,7 @@ class Histogram:
     def from_sparse(
         cls, indices: Sequence[int], counts: Sequence[int], lost: int, *, layout: int = LAYOUT
     ) -> Histogram:
-        """The inverse of `to_sparse`; raises DecodeError on anything that `to_sparse` cannot have made."""
+        """Invert `to_sparse`; raise DecodeError on anything that `to_sparse` cannot have made."""
         if layout != LAYOUT:
             raise DecodeError(f"histogram layout {layout} is not {LAYOUT}")
         if len(indices) != len(counts):
@@ -296,7 +296,7 @@ def _edges() -> NDArray[np.float64]:
 
 
 def _check_sparse(indices: tuple[int, ...], counts: tuple[int, ...], lost: int) -> None:
-    """Check as many of both; raises DecodeError on the first that is wrong."""
+    """Check indices and counts, equally many; raise DecodeError on the first that is wrong."""
     ascend = indices[0] >= 0 and indices[-1] < BUCKETS and all(map(lt, indices, indices[1:]))
     if ascend and min(counts) >= 1 and sum(counts) + lost <= MAX_COUNT:
         return

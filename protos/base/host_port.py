@@ -1,4 +1,4 @@
-"""host:port as text, checked."""
+"""Parses and checks host:port texts."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ _UNSPECIFIED = ("0.0.0.0", "::")  # noqa: S104 - refused, not listened on
 
 
 def split_host_port(text: str) -> tuple[str, int]:
-    """Split host:port (name, IPv4, or IPv6 in brackets); raises ValueError that says what was expected."""
+    """Split host:port (name, IPv4, or IPv6 in brackets); raise a ValueError that says what was expected."""
     if "//" in text:
         raise ValueError(f"expected host:port without {text.partition('//')[0]}//, got {text!r}")
     host, _, port = text.rpartition(":")
@@ -29,7 +29,7 @@ def split_host_port(text: str) -> tuple[str, int]:
 
 
 def canonical_ip(text: str) -> str:
-    """Return an IPv4 or IPv6 address in canonical form; raises ValueError that says what was expected."""
+    """Return an IPv4 or IPv6 address in canonical form; raise a ValueError that says what was expected."""
     try:
         address = ip_address(text)
     except ValueError:
@@ -40,7 +40,7 @@ def canonical_ip(text: str) -> str:
 
 
 def check_remote(text: str) -> str:
-    """Check host:port of a server to connect to; raises ValueError that says what was expected."""
+    """Check host:port of a server to connect to; raise a ValueError that says what was expected."""
     host, port = split_host_port(text)
     if port == 0:
         raise ValueError(f"expected host:port with a port from 1 to {_MAX_PORT}, got {text!r}")
@@ -50,7 +50,7 @@ def check_remote(text: str) -> str:
 
 
 def numeric_host(host_port: str) -> tuple[str, int] | None:
-    """The address that host:port, already checked, is; None if it is a name."""
+    """Return the address in host:port, already checked; None if it is a name."""
     host, port = split_host_port(host_port)
     try:
         return canonical_ip(host), port
@@ -59,7 +59,7 @@ def numeric_host(host_port: str) -> tuple[str, int] | None:
 
 
 def is_loopback(host_port: str) -> bool:
-    """Whether host:port, already checked, stays on this machine; a name other than localhost may lead anywhere."""
+    """Return whether host:port, already checked, is on this machine; a name other than localhost may lead anywhere."""
     host, _ = split_host_port(host_port)
     try:
         return ip_address(host).is_loopback

@@ -1,12 +1,12 @@
-"""Text of others on a terminal or in a log. Pure."""
+"""Makes others' text safe for a terminal or a log. Pure."""
 
 from __future__ import annotations
 
 
 def escaped(text: str) -> str:
-    """`text` on one line, with escapes, as `repr` writes them, in place of what is not printable.
+    """Return `text` on one line, with unprintable characters replaced by escapes as `repr` writes them.
 
-    An escape sequence would move the cursor of whoever reads it, a line feed begin a line that looks like one of ours.
+    An escape sequence would move the reader's cursor, and a line feed would begin a line that looks like one of ours.
     """
     if text.isprintable():
         return text

@@ -1,10 +1,10 @@
-"""How often something may happen: so many at once, and so many a second after that."""
+"""Limits how often something may happen: a burst at once, and then a rate per second."""
 
 from __future__ import annotations
 
 
 class TokenBucket:
-    """Full at first; `rate` tokens a second come back, up to `burst`. Times are monotonic seconds."""
+    """A token bucket, full at first; `rate` tokens a second come back, up to `burst`. Times are monotonic seconds."""
 
     __slots__ = ("_at", "_burst", "_rate", "_tokens")
 
@@ -15,7 +15,7 @@ class TokenBucket:
         self._at = now
 
     def take(self, now: float, cost: float = 1.0) -> bool:
-        """Take `cost` tokens; False, and nothing is taken, if they are not there."""
+        """Take `cost` tokens; if there are too few, take nothing and return False."""
         self._tokens = min(self._burst, self._tokens + self._rate * max(0.0, now - self._at))
         self._at = max(self._at, now)
         if self._tokens < cost:
@@ -24,9 +24,9 @@ class TokenBucket:
         return True
 
     def fill(self, now: float) -> None:
-        """All of them are back."""
+        """Fill the bucket."""
         self._tokens, self._at = self._burst, max(self._at, now)
 
     def is_full(self, now: float) -> bool:
-        """Whether it is as good as a new one."""
+        """Return whether the bucket is full, like a new one."""
         return self._tokens + self._rate * max(0.0, now - self._at) >= self._burst

@@ -1,9 +1,9 @@
-"""Protobuf <-> model, both ways, validating.
+"""Converts between protobuf and model in both directions, and validates.
 
-`*_to_proto` encodes a model value. `*_from_proto` checks every field of a message of the network and returns
-a model value, or raises `DecodeError` and nothing else; `parse_*` does the same from bytes. A value comes
-back from its own encoding unchanged, but for what the format rounds: times to microseconds, texts for people
-to `MAX_STRING_BYTES` printable bytes.
+`*_to_proto` encodes a model value. `*_from_proto` checks every field of a message from the network and returns a model
+value, or raises `DecodeError` and nothing else; `parse_*` does the same from bytes. A value survives encoding and
+decoding unchanged, except for what the format rounds: times to microseconds, texts for people to `MAX_STRING_BYTES`
+printable bytes.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Conversion of what the operator sees (admin.proto)."""
+"""Converts what the operator sees (admin.proto)."""
 
 from __future__ import annotations
 
@@ -62,12 +62,12 @@ def own_revocations_from_proto(message: admin_pb2.GetStatusResponse) -> Revocati
 def status_to_proto(
     sidecars: Iterable[SidecarStatus], own: RevocationSet = NO_REVOCATIONS
 ) -> admin_pb2.GetStatusResponse:
-    """Encode the status of all sidecars, without their tokens and credentials; `own` is of the control plane."""
+    """Encode the status of all sidecars, without their tokens and credentials; `own` is the control plane's."""
     return admin_pb2.GetStatusResponse(sidecars=map(_sidecar_to_proto, sidecars), revocations=revocations_to_proto(own))
 
 
 def status_query_from_proto(message: admin_pb2.StreamStatusRequest) -> StatusQuery:
-    """Check a question for the status."""
+    """Check a query for the status."""
     if len(message.names) > MAX_SIDECARS:
         raise DecodeError(f"names has {len(message.names)} elements, more than {MAX_SIDECARS}")
     unique(message.names, "names")
@@ -75,7 +75,7 @@ def status_query_from_proto(message: admin_pb2.StreamStatusRequest) -> StatusQue
 
 
 def status_query_to_proto(query: StatusQuery) -> admin_pb2.StreamStatusRequest:
-    """Encode a question for the status."""
+    """Encode a query for the status."""
     return admin_pb2.StreamStatusRequest(names=query.names, detailed_at_most=query.detailed_at_most)
 
 
@@ -134,7 +134,7 @@ def _unanswered_from_proto(messages: Collection[admin_pb2.UnansweredService]) ->
 
 
 def resource_from_proto(message: admin_pb2.ResourceStatus) -> ResourceStatus:
-    """Check how far a sidecar follows."""
+    """Check how far a sidecar has applied a resource."""
     return ResourceStatus(
         version_sent=version(message.version_sent, "version_sent"),
         version_acked=version(message.version_acked, "version_acked"),
@@ -144,7 +144,7 @@ def resource_from_proto(message: admin_pb2.ResourceStatus) -> ResourceStatus:
 
 
 def resource_to_proto(status: ResourceStatus) -> admin_pb2.ResourceStatus:
-    """Encode how far a sidecar follows."""
+    """Encode how far a sidecar has applied a resource."""
     return admin_pb2.ResourceStatus(
         version_sent=status.version_sent,
         version_acked=status.version_acked,

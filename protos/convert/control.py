@@ -1,4 +1,4 @@
-"""Conversion of the two directions of the control stream (control.proto)."""
+"""Converts the messages of both directions of the control stream (control.proto)."""
 
 from __future__ import annotations
 
@@ -88,7 +88,7 @@ def parse_sidecar_message(data: bytes) -> SidecarMessage:
 
 
 def parse_in_parts(data: bytes) -> Iterator[SidecarMessage]:
-    """The same, with a report in parts that each take a moment."""
+    """Do the same, but yield a report in parts that each take little time."""
     message = read_sidecar_message(data)
     if message.WhichOneof("kind") == "report":
         yield from report_parts(message.report)
@@ -97,7 +97,7 @@ def parse_in_parts(data: bytes) -> Iterator[SidecarMessage]:
 
 
 def read_sidecar_message(data: bytes) -> control_pb2.SidecarMessage:
-    """Parse the bytes of one message of a sidecar, and check no more than that it is not too costly."""
+    """Parse the bytes of one message of a sidecar, and check only that it is not too costly."""
     check_cost(data)
     try:
         return control_pb2.SidecarMessage.FromString(data)
@@ -154,14 +154,14 @@ def sidecar_message_from_proto(message: control_pb2.SidecarMessage) -> SidecarMe
 
 
 def _of_no_kind(message: control_pb2.SidecarMessage | control_pb2.ControlMessage) -> DecodeError:
-    # protobuf keeps the bytes of fields that it does not know.
+    # protobuf keeps the bytes of unknown fields.
     if message.ByteSize():
         return UnknownKindError("a message of no known kind: its sender is newer")
     return DecodeError("a message of no known kind: empty")
 
 
 def revocations_from_proto(message: control_pb2.Revocations) -> RevocationSet:
-    """Check which revocation lists somebody uses."""
+    """Check which revocation lists are in use."""
     lists = each(message.lists, MAX_CA_CERTIFICATES, "lists", _held_list_from_proto)
     unique((one.ca for one in lists), "lists")
     if message.too_old > MAX_CA_CERTIFICATES:
@@ -176,7 +176,7 @@ def _held_list_from_proto(message: control_pb2.HeldList) -> HeldList:
 
 
 def revocations_to_proto(value: RevocationSet) -> control_pb2.Revocations:
-    """Encode which revocation lists somebody uses."""
+    """Encode which revocation lists are in use."""
     lists = [control_pb2.HeldList(ca=one.ca, number=one.number, signed_at_s=one.signed_at_s) for one in value.lists]
     return control_pb2.Revocations(lists=lists, too_old=value.too_old)
 
@@ -349,7 +349,7 @@ def _peer_set_to_proto(value: PeerSet) -> control_pb2.PeerSet:
 
 
 def peer_set_header_to_proto(value: PeerSet) -> control_pb2.PeerSet:
-    """Encode a set of peers without the peers, and as one that does not go on."""
+    """Encode a set of peers without the peers, and without a continuation."""
     return control_pb2.PeerSet(
         version=value.version,
         nonce=value.nonce,
@@ -365,6 +365,6 @@ def peer_set_header_to_proto(value: PeerSet) -> control_pb2.PeerSet:
 def _removed_from_proto(message: control_pb2.RemovedPeer) -> RemovedPeer:
     return RemovedPeer(
         name=node_name(message.name, "removed peer"),
-        # One that only a newer control plane knows may be as grave as any: the peer goes, whatever its paths prove.
+        # A reason that only a newer control plane knows may be a grave one: the peer goes, whatever its paths prove.
         reason=_REASONS.get(message.reason, RemovalReason.FORBIDDEN),
     )

@@ -1,4 +1,4 @@
-"""Conversion of what happened in the fleet, and of who is gone (admin.proto)."""
+"""Converts fleet events and departed sidecars (admin.proto)."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ MAX_FLEET_EVENTS = 65_536
 """Events in one answer."""
 
 MAX_DEPARTED = 8192
-"""Sidecars that are gone in one status."""
+"""Departed sidecars in one status."""
 
 MAX_SERVICES = 1024
-"""Services of one of them."""
+"""Services of one departed sidecar."""
 
 MAX_AGE_US = round(MAX_DURATION_S * US_PER_S) * 36_525
 """A century: a longer age is a mistake of units."""
@@ -56,7 +56,7 @@ _KIND_NUMBERS = {kind: number for number, kind in _KINDS.items()}
 
 
 def event_query_from_proto(message: admin_pb2.ListEventsRequest) -> EventQuery:
-    """Check a question for events."""
+    """Check a query for events."""
     return EventQuery(
         node=node_name(message.node, "node") if message.node else None,
         after=message.after,
@@ -66,14 +66,14 @@ def event_query_from_proto(message: admin_pb2.ListEventsRequest) -> EventQuery:
 
 
 def event_query_to_proto(query: EventQuery) -> admin_pb2.ListEventsRequest:
-    """Encode a question for events."""
+    """Encode a query for events."""
     return admin_pb2.ListEventsRequest(
         node=query.node or "", after=query.after, since_us=microseconds(query.since), last=query.last
     )
 
 
 def event_list_from_proto(message: admin_pb2.ListEventsResponse) -> EventList:
-    """Check the events asked for."""
+    """Check the answer to a query for events."""
     return EventList(
         events=events_from_proto(message.events),
         left_out=at_most(message.left_out, MAX_EVENTS, "left_out"),
@@ -114,17 +114,17 @@ def event_to_proto(event: FleetEvent) -> admin_pb2.FleetEvent:
 
 
 def why_from_proto(value: admin_pb2.DepartureReason.ValueType) -> Why:
-    """Check why somebody is gone."""
+    """Check why a sidecar is gone."""
     return known(value, _WHY, "departure reason")
 
 
 def why_to_proto(why: Why | None) -> admin_pb2.DepartureReason.ValueType:
-    """Encode why somebody is gone; None: nobody is."""
+    """Encode why a sidecar is gone; None: it is not."""
     return admin_pb2.DEPARTURE_REASON_UNSPECIFIED if why is None else _WHY_NUMBERS[why]
 
 
 def departed_from_proto(messages: Sequence[admin_pb2.DepartedSidecar]) -> tuple[DepartedSidecar, ...]:
-    """Check who is gone."""
+    """Check the departed sidecars."""
     return each(messages, MAX_DEPARTED, "departed", _departed_from_proto)
 
 
@@ -142,7 +142,7 @@ def _departed_from_proto(message: admin_pb2.DepartedSidecar) -> DepartedSidecar:
 
 
 def departed_to_proto(gone: DepartedSidecar) -> admin_pb2.DepartedSidecar:
-    """Encode one that is gone."""
+    """Encode a departed sidecar."""
     return admin_pb2.DepartedSidecar(
         name=gone.name,
         role=role_to_proto(gone.role),
@@ -156,7 +156,7 @@ def departed_to_proto(gone: DepartedSidecar) -> admin_pb2.DepartedSidecar:
 
 
 def log_state_from_proto(message: admin_pb2.EventLogState) -> EventLogState:
-    """Check how the log of events is doing."""
+    """Check the state of the event log."""
     return EventLogState(
         kept=at_most(message.kept, MAX_EVENTS, "kept"),
         evicted=at_most(message.evicted, MAX_EVENTS, "evicted"),
@@ -169,7 +169,7 @@ def log_state_from_proto(message: admin_pb2.EventLogState) -> EventLogState:
 
 
 def log_state_to_proto(state: EventLogState) -> admin_pb2.EventLogState:
-    """Encode how the log of events is doing."""
+    """Encode the state of the event log."""
     return admin_pb2.EventLogState(
         kept=state.kept,
         evicted=state.evicted,

@@ -1,4 +1,4 @@
-"""Conversion of why a mapping is as it is (admin.proto)."""
+"""Converts explanations of mappings (admin.proto)."""
 
 from __future__ import annotations
 
@@ -78,7 +78,7 @@ _STATE_NUMBERS = {value: number for number, value in _STATES.items()}
 
 
 def explain_request_from_proto(message: admin_pb2.ExplainRequest) -> tuple[NodeName, ServiceName]:
-    """Check what is asked for: a robot and one of its services."""
+    """Check a request: a robot and one of its services."""
     return node_name(message.robot, "robot"), service_name(message.service, "service")
 
 
@@ -142,7 +142,7 @@ def _charge(message: admin_pb2.ExplainResponse | admin_pb2.Alternative) -> float
 
 
 def _age(age_us: int, field: str) -> float:
-    # A mapping may be in force for longer than the longest deadline or lease; a century is a mistake of units.
+    # A mapping may be in force for longer than the longest deadline or lease; beyond a century it is a unit mistake.
     return at_most(age_us, round(MAX_DURATION_S * US_PER_S) * 36_525, field) / US_PER_S
 
 

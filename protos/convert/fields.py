@@ -1,4 +1,4 @@
-"""Limits and checks of single fields; a check returns the value or raises DecodeError naming the field."""
+"""Checks single fields against limits; a check returns the value or raises a DecodeError that names the field."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from google.protobuf.message import Message
 
 MAX_CANDIDATES = 256
-"""Addresses of one sidecar: a dozen interfaces with a handful of IPv6 addresses each stay well below."""
+"""Addresses of one sidecar; a dozen interfaces with a handful of IPv6 addresses each stay well below."""
 
 MAX_OFFERS = 1024
 """Services one cloud sidecar offers."""
@@ -44,16 +44,16 @@ MAX_SIDECARS = 8192
 """Sidecars in one status."""
 
 MAX_DURATION_S = 86_400.0
-"""Longest deadline, lease or interval: one day. What is longer is a mistake of units."""
+"""Longest deadline, lease or interval: one day. Anything longer is a unit mistake."""
 
 MAX_EVENTS = 1 << 53
-"""Largest count of datagrams or requests in one report: what a float still holds exactly."""
+"""Largest count of datagrams or requests in one report: the largest that a float holds exactly."""
 
 MAX_CAPACITY = 1_000_000
-"""Largest capacity of a server; more is written 0, no limit."""
+"""Largest capacity of a server; a larger one is written as 0, no limit."""
 
 MAX_CHARGE = 1e9
-"""Largest charge of an interface or a server for one request; what is larger is a mistake."""
+"""Largest charge of an interface or a server for one request; a larger one is a mistake."""
 
 MAX_COPIES = 256
 """Copies of one request: as many as a robot can have interfaces."""
@@ -66,7 +66,7 @@ P = TypeVar("P", bound="Message")
 
 
 def duration(microseconds: int, field: str, *, zero: bool = False) -> float:
-    """Check a span of time and turn it into seconds; 0 only where `zero` allows it."""
+    """Check a duration and convert it to seconds; 0 is valid only if `zero` allows it."""
     if microseconds == 0 and not zero:
         raise DecodeError(f"{field} is 0")
     if microseconds > MAX_DURATION_S * US_PER_S:
@@ -75,7 +75,7 @@ def duration(microseconds: int, field: str, *, zero: bool = False) -> float:
 
 
 def microseconds(seconds: float) -> int:
-    """Round seconds for the network."""
+    """Convert seconds to microseconds for the network, rounded."""
     return round(seconds * US_PER_S)
 
 
@@ -106,7 +106,7 @@ def version(value: int, field: str) -> Version:
 
 
 def known(value: K, names: Mapping[K, T], field: str) -> T:
-    """Check an enum and turn it into the model's."""
+    """Check an enum value and convert it to the model's."""
     if value not in names:
         raise DecodeError(f"{field} has no meaning for the value {value}")
     return names[value]
@@ -125,7 +125,7 @@ def each(messages: Sequence[P], limit: int, field: str, convert: Callable[[P], T
 
 
 def unique(keys: Iterable[Hashable], field: str) -> None:
-    """Check that nothing is named twice."""
+    """Check that no key occurs twice."""
     seen: set[Hashable] = set()
     for key in keys:
         if key in seen:

@@ -1,4 +1,4 @@
-"""Conversion of mappings."""
+"""Converts mappings."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
-"""What a message of a sidecar would become, read off its bytes before anything is made of them.
+"""Checks from the bytes of a sidecar's message what parsing it would cost, before it is parsed.
 
-Two bytes can be an element of a list, which takes a hundred once it is parsed: 4 MiB of them hold up a program for
-seconds, and fill its memory. So the fields are counted first.
+Two bytes can be an element of a list, which takes a hundred bytes once parsed: 4 MiB of them hold up a program for
+seconds and fill its memory. So the fields are counted first.
 """
 
 from __future__ import annotations
@@ -14,10 +14,10 @@ from protos.plr.v1 import control_pb2
 from protos.trust.identity import MAX_CA_CERTIFICATES
 
 CHEAP_BYTES = 4096
-"""What is no longer is cheap whatever it holds."""
+"""A message no longer than this is cheap whatever it holds."""
 
 SPARE_FIELDS = 1024
-"""Single fields, and those of a newer sidecar."""
+"""Room for single fields, and for those of a newer sidecar."""
 
 _NAMES = {field.number: field.name for field in control_pb2.SidecarMessage.DESCRIPTOR.fields}
 
@@ -27,13 +27,13 @@ _ELEMENTS = {
     "report": MAX_LATENCIES + MAX_PATHS + MAX_OUTCOMES + 2 * MAX_JOINTS + MAX_PENALTIES + MAX_GOODBYES,
     "revocations": MAX_CA_CERTIFICATES,
 }
-"""In all lists of a message of this kind; the others have none."""
+"""Most elements in all lists of a message of this kind; other kinds have none."""
 
 _MALFORMED = "not a SidecarMessage: its fields do not fit its length"
 
 
 def check_cost(data: bytes) -> None:
-    """Raise DecodeError if these bytes hold more than one message of a sidecar does, or if they are cut short."""
+    """Raise DecodeError if these bytes hold more than a sidecar's message can, or if they are cut short."""
     if len(data) <= CHEAP_BYTES:
         return
     at, fields, kind = 0, 0, None
@@ -75,7 +75,7 @@ def _field(data: bytes, at: int, end: int) -> tuple[int, int, int]:
         case 5:
             begin, stop = at, at + 4
         case _:
-            # Groups: no version has any.
+            # Groups, which no version uses.
             raise DecodeError(_MALFORMED)
     if stop > end:
         raise DecodeError(_MALFORMED)
@@ -83,7 +83,7 @@ def _field(data: bytes, at: int, end: int) -> tuple[int, int, int]:
 
 
 def _varint(data: bytes, at: int, end: int) -> tuple[int, int]:
-    """Return a number, and where it ends."""
+    """Return the number that begins here, and where it ends."""
     value = shift = 0
     while at < end and shift < 70:
         byte = data[at]

@@ -1,4 +1,4 @@
-"""Conversion of what sidecars measured."""
+"""Converts sidecars' measurements."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ if TYPE_CHECKING:
     from protos.model.ids import NodeName
 
 PART_ENTRIES = 32
-"""Some 2 ms, with what is made of them."""
+"""Entries in one part; with their processing they take some 2 ms."""
 
 
 def report_from_proto(message: control_pb2.Report) -> Report:
@@ -64,9 +64,9 @@ def report_from_proto(message: control_pb2.Report) -> Report:
 
 
 def report_parts(message: control_pb2.Report) -> Iterator[Report]:
-    """Check a report, some `PART_ENTRIES` entries at a time: together the parts tell what the whole does.
+    """Check a report, some `PART_ENTRIES` entries at a time; together, the parts hold what the whole does.
 
-    Raises DecodeError as `report_from_proto`, lists that are too long first.
+    Raises DecodeError like `report_from_proto`, for lists that are too long first.
     """
     lists: tuple[tuple[str, int], ...] = (
         *(("outcomes", MAX_OUTCOMES), ("latencies", MAX_LATENCIES), ("joints", MAX_JOINTS)),
@@ -89,7 +89,7 @@ def report_parts(message: control_pb2.Report) -> Iterator[Report]:
 
 
 def report_entries(report: Report) -> int:
-    """How many entries take time to read or to merge."""
+    """Return the number of entries that take time to read or merge."""
     lists = (report.latencies, report.paths, report.outcomes, report.joints, report.interface_joints, report.penalties)
     return sum(map(len, lists)) + len(report.goodbyes)
 

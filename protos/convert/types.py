@@ -1,4 +1,4 @@
-"""Conversion of the nouns both planes share (types.proto)."""
+"""Converts the types that both planes share (types.proto)."""
 
 from __future__ import annotations
 
@@ -46,10 +46,10 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
 LEAST_TARGET = 1e-9
-"""Least miss probability that can be wanted: one request in years."""
+"""Smallest miss probability that can be wanted: one request in years."""
 
 MAX_INTERFACE_ID = 255
-"""The data plane's frames give an interface one byte."""
+"""Largest number of an interface, which takes one byte in the data plane's frames."""
 
 _ROLES = {types_pb2.ROLE_ROBOT: Role.ROBOT, types_pb2.ROLE_CLOUD: Role.CLOUD}
 _ROLE_NUMBERS = {role: number for number, role in _ROLES.items()}
@@ -79,7 +79,7 @@ def role_to_proto(role: Role) -> types_pb2.Role.ValueType:
 
 
 def address_from_proto(message: types_pb2.Address) -> Address:
-    """Check the address of one host: not unspecified, nor multicast or broadcast, which reach many."""
+    """Check the address of a single host: neither unspecified nor multicast or broadcast, which reach many."""
     if len(message.ip) not in (4, 16):
         raise DecodeError(f"address has {len(message.ip)} bytes, not 4 or 16")
     if not 1 <= message.port <= 65535:
@@ -118,7 +118,7 @@ def candidate_to_proto(candidate: Candidate) -> types_pb2.Candidate:
 
 
 def announced_from_proto(messages: Sequence[types_pb2.Candidate]) -> tuple[Candidate, ...]:
-    """Check what a sidecar announces: as `candidates_from_proto`, and no more of one interface than peers use."""
+    """Check what a sidecar announces: like `candidates_from_proto`, but no more per interface than peers use."""
     candidates = candidates_from_proto(messages)
     for name, count in Counter(candidate.interface for candidate in candidates).items():
         if count > MAX_CANDIDATES_OF_INTERFACE:
@@ -127,7 +127,7 @@ def announced_from_proto(messages: Sequence[types_pb2.Candidate]) -> tuple[Candi
 
 
 def candidates_from_proto(messages: Sequence[types_pb2.Candidate]) -> tuple[Candidate, ...]:
-    """Check all candidates of a sidecar: numbers and names of interfaces belong together one to one."""
+    """Check all candidates of a sidecar: numbers and names of interfaces must correspond one to one."""
     candidates = each(messages, MAX_CANDIDATES, "candidates", candidate_from_proto)
     unique(candidates, "candidates")
     interfaces = {(candidate.interface_id, candidate.interface) for candidate in candidates}
@@ -139,7 +139,7 @@ def candidates_from_proto(messages: Sequence[types_pb2.Candidate]) -> tuple[Cand
 def labels_from_proto(
     messages: Sequence[types_pb2.InterfaceLabel], candidates: Sequence[Candidate]
 ) -> tuple[InterfaceLabel, ...]:
-    """Check what a sidecar says of the interfaces that its candidates name."""
+    """Check what a sidecar says about the interfaces that its candidates name."""
     labels = each(messages, MAX_CANDIDATES, "labels", _label_from_proto)
     unique((label.interface for label in labels), "labels")
     known_names = {candidate.interface for candidate in candidates}
@@ -152,7 +152,7 @@ def labels_from_proto(
 def down_from_proto(
     messages: Sequence[types_pb2.InterfaceLabel], candidates: Sequence[Candidate]
 ) -> tuple[InterfaceLabel, ...]:
-    """Check which interfaces carry nothing: none that a candidate names."""
+    """Check which interfaces carry nothing; no candidate may name them."""
     down = each(messages, MAX_CANDIDATES, "down", _label_from_proto)
     names = [label.interface for label in down]
     unique(names, "down")
@@ -171,7 +171,7 @@ def _label_from_proto(message: types_pb2.InterfaceLabel) -> InterfaceLabel:
 
 
 def label_to_proto(label: InterfaceLabel) -> types_pb2.InterfaceLabel:
-    """Encode what a sidecar says of an interface."""
+    """Encode what a sidecar says about an interface."""
     return types_pb2.InterfaceLabel(interface=label.interface, carrier=label.carrier, charge=label.charge)
 
 
@@ -207,7 +207,7 @@ def use_from_proto(message: types_pb2.ServiceUse) -> ServiceUse:
         copies=_copies_from_proto(message),
         target_miss=_target(message.target_miss),
         fallback_up=message.fallback_up if message.has_fallback else None,
-        # A mode of a later version: nothing but the prediction hangs on it, and no copies promise the least.
+        # For a mode of a later version, assume the one that promises least: only the prediction depends on it.
         redundancy=_REDUNDANCY_MODES.get(message.redundancy, RedundancyMode.SINGLE),
         hedge_quantile=probability(message.hedge_quantile, "hedge_quantile") or DEFAULT_HEDGE_QUANTILE,
         budgeted=message.budgeted,
@@ -224,7 +224,7 @@ def _copies_from_proto(message: types_pb2.ServiceUse) -> Copies:
 
 
 def _target(value: float) -> float:
-    """Check the wanted miss probability; 0 wants none. A smaller one than can be counted in a lifetime is that one."""
+    """Check the wanted miss probability; 0 means none. Any below LEAST_TARGET, which is beyond counting, becomes it."""
     return max(probability(value, "target_miss"), LEAST_TARGET) if value else 0.0
 
 
@@ -248,7 +248,7 @@ def use_to_proto(use: ServiceUse) -> types_pb2.ServiceUse:
 
 
 def peer_from_proto(message: types_pb2.Peer, *, with_token: bool = True) -> Peer:
-    """Check a peer; what is shown to the operator comes without its token."""
+    """Check a peer; when shown to the operator it comes without its token."""
     if len(message.token) != (TOKEN_BYTES if with_token else 0):
         raise DecodeError(f"token has {len(message.token)} bytes, not {TOKEN_BYTES if with_token else 0}")
     return Peer(
@@ -279,21 +279,21 @@ def permit_from_proto(message: types_pb2.Peer) -> CallPermit:
 
 
 def service_names(values: Sequence[str], limit: int, field: str) -> tuple[ServiceName, ...]:
-    """Check a repeated field of at most `limit` names of services."""
+    """Check a repeated field of at most `limit` service names."""
     if len(values) > limit:
         raise DecodeError(f"{field} has {len(values)} elements, more than {limit}")
     return tuple(service_name(value, field) for value in values)
 
 
 def interface_names(values: Sequence[str], field: str) -> tuple[InterfaceName, ...]:
-    """Check a repeated field of names of interfaces."""
+    """Check a repeated field of interface names."""
     if len(values) > MAX_CANDIDATES:
         raise DecodeError(f"{field} has {len(values)} elements, more than {MAX_CANDIDATES}")
     return tuple(interface_name(value, field) for value in values)
 
 
 def credential_from_proto(value: bytes) -> bytes:
-    """Check the size of a credential; what stands in it is for the peers to judge."""
+    """Check the size of a credential; its content is for the peers to judge."""
     if len(value) > MAX_CREDENTIAL_BYTES:
         raise DecodeError(f"credential has {len(value)} bytes, more than {MAX_CREDENTIAL_BYTES}")
     return value
@@ -307,7 +307,7 @@ def signature_from_proto(value: bytes) -> bytes:
 
 
 def session_from_proto(value: int) -> SessionId:
-    """Check a session number; 0 is what a field never written holds."""
+    """Check a session number; 0 means that the field was never written."""
     if value == 0:
         raise DecodeError("session is 0")
     return SessionId(value)
@@ -333,7 +333,7 @@ def peer_to_proto(peer: Peer) -> types_pb2.Peer:
 
 
 def histogram_from_proto(message: types_pb2.Histogram) -> Histogram:
-    """Check a histogram; a message never filled in is an empty one."""
+    """Check a histogram; an unset message is an empty one."""
     layout, lost = message.layout, message.lost
     for field, values in (("index", message.index), ("count", message.count)):
         if len(values) > BUCKETS:

@@ -1,1 +1,1 @@
-"""The words both planes speak: frozen values and typed identifiers. Imports `base`."""
+"""Defines the vocabulary of both planes: frozen values and typed identifiers. Imports `base`."""

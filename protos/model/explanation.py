@@ -1,7 +1,7 @@
-"""Why a robot's service goes where it goes, as the control plane tells it to the operator. Times are seconds.
+"""Explains to the operator why a robot's service is mapped as it is. Times are in seconds.
 
-Samples fade, so what the control plane keeps of them are weights, not counts: histograms here count thousandths of a
-sample (`SAMPLE`), and numbers of requests are floats.
+Samples fade, so the control plane keeps weights, not counts, of them: histograms here count thousandths of a sample
+(`SAMPLE`), and numbers of requests are floats.
 """
 
 from __future__ import annotations
@@ -18,12 +18,12 @@ if TYPE_CHECKING:
     from protos.model.status import ResourceStatus
 
 SAMPLE = 1000
-"""What one sample that has not faded counts in a histogram."""
+"""Weight of a sample that has not faded in a histogram."""
 
 
 @dataclass(frozen=True, slots=True)
 class Belief:
-    """What is believed of a probability: its expectation, and the ends of the interval that holds it with 90 %."""
+    """An estimate of a probability: its expectation and its 90 % interval."""
 
     mean: float
     low: float
@@ -32,38 +32,38 @@ class Belief:
 
 @dataclass(frozen=True, slots=True)
 class PairExplanation:
-    """What is known of requests over one interface to one server."""
+    """What is known about requests over one interface to one server."""
 
     path: Assignment
     chosen: bool
     up: bool | None
     """Whether the path was up when last reported; None if it never was reported."""
     miss: Belief | None
-    """Its probability to miss the deadline as the matcher took it; None if it was no candidate."""
+    """Probability of a missed deadline that the matcher used; None if the pair was no candidate."""
     requests: float
-    """Requests whose outcome on this very pair is remembered."""
+    """Requests whose outcome on exactly this pair is remembered."""
     probes: float
     rtt: Histogram
     network: Histogram
-    """What the network took of requests of the service's sizes, whichever service they were for."""
+    """Network times of requests of the service's sizes, for any service."""
     compute: Histogram
-    """What the server needed for the service, whoever asked."""
+    """Times that the server needed for the service, for any robot."""
     carrier: str = ""
-    """Whose network the interface uses; empty if nobody said."""
+    """Carrier whose network the interface uses; empty if unknown."""
     region: str = ""
-    """Where the server stands; empty if nobody said."""
+    """Region of the server; empty if unknown."""
     barred: bool = False
-    """The operator's path rules keep mappings from it."""
+    """Whether the operator's path rules forbid it in mappings."""
     witnesses: int = 0
-    """Robots that said what the server needs."""
+    """Number of robots that reported the server's times."""
     busiest_witness: NodeName | None = None
-    """Whose word counts for most; None without witnesses."""
+    """The robot whose reports count most; None without witnesses."""
     busiest_share: float = 0.0
-    """For what share of all."""
+    """That robot's share of all reports."""
     penalty_s: float = 0.0
-    """The robot asks others in place of this server for so long yet, ..."""
+    """How much longer the robot prefers others to this server, ..."""
     bad_answers: int = 0
-    """... for so many answers that could not be delivered."""
+    """... because of this many answers that could not be delivered."""
 
 
 class Correlation(enum.Enum):
@@ -76,15 +76,15 @@ class Correlation(enum.Enum):
 
 @dataclass(frozen=True, slots=True)
 class JointExplanation:
-    """What became of requests that went over two interfaces at once."""
+    """Outcomes of requests that went over two interfaces at once."""
 
     first: InterfaceName
     second: InterfaceName
     server: NodeName | None
-    """Of both copies; None for those to two servers, whichever these were."""
+    """Server of both copies; None for requests to any two servers."""
     requests: float
     first_missed: float
-    """Of these requests; estimated, above 0."""
+    """Number of these requests; estimated, above 0."""
     second_missed: float
     both_missed: float
     correlation: Correlation
@@ -93,20 +93,20 @@ class JointExplanation:
 
     @property
     def expected(self) -> float:
-        """How many requests would have missed on both if the interfaces failed independently."""
+        """Number of requests that would have missed on both if the interfaces failed independently."""
         return self.first_missed * self.second_missed / self.requests
 
     @property
     def lift(self) -> float:
-        """How many times as often as by chance both missed."""
+        """Ratio of joint misses to those expected by chance."""
         return self.both_missed / self.expected
 
 
 class AlternativeKind(enum.Enum):
-    """What is asked about another mapping."""
+    """Which alternatives to a mapping are considered."""
 
     OTHER = "other"
-    """The best ones that are not in force."""
+    """The best mappings that are not in force."""
     ALONE = "alone"
     """One interface alone, to the server that suits it best."""
     WITHOUT = "without"
@@ -115,17 +115,17 @@ class AlternativeKind(enum.Enum):
 
 @dataclass(frozen=True, slots=True)
 class Alternative:
-    """Another mapping, and what it would give."""
+    """Another mapping, and its predicted result."""
 
     kind: AlternativeKind
     assignments: tuple[Assignment, ...]
-    """None if there is no such mapping."""
+    """Empty if there is no such mapping."""
     predicted_miss: float
     without: NodeName | None = None
     note: str = ""
-    """What speaks against it, in words."""
+    """Objections to it, in words."""
     charge: float | None = None
-    """What a request would cost with all its copies; None unless the service is to be cheap."""
+    """Cost of a request with all its copies; None unless the service is in mode cheapest."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -139,7 +139,7 @@ class MappingChange:
 
 @dataclass(frozen=True, slots=True)
 class Explanation:
-    """Why a robot's requests for a service go where they go."""
+    """Why a robot's requests for a service are mapped as they are."""
 
     robot: NodeName
     service: ServiceName
@@ -148,26 +148,26 @@ class Explanation:
     objective: str
     """What the matcher minimises, a value of the configuration key `objective`."""
     sync: ResourceStatus
-    """How far the robot follows its mapping, of all its services."""
+    """How far the robot has applied its mapping, which covers all its services."""
     mapping: ServiceMapping | None = None
-    """As last sent; None if nothing was."""
+    """The mapping last sent; None if none was."""
     predicted_miss: float | None = None
-    """What is predicted now; `mapping` has what was predicted when it was sent. None if nothing is planned."""
+    """Current prediction; `mapping` has the one from when it was sent. None if nothing is planned."""
     in_force_s: float | None = None
-    """Since when requests go where they go; None if that is forgotten."""
+    """How long the current assignments have been in force; None if that is forgotten."""
     target_miss: float = 0.0
-    """Above 0: the service goes where it is cheapest as long as it misses no more often."""
+    """Above 0: the cheapest mapping that misses no more often is chosen."""
     charge: float | None = None
-    """What a request costs with all its copies; None unless the service is to be cheap."""
+    """Cost of a request with all its copies; None unless the service is in mode cheapest."""
     observed_miss: float | None = None
     """Share of recent requests that missed the deadline or failed; None without any."""
     pairs: tuple[PairExplanation, ...] = ()
     pairs_left_out: int = 0
-    """Pairs that were too many to be told of."""
+    """Number of pairs left out because there were too many."""
     joints: tuple[JointExplanation, ...] = ()
     alternatives: tuple[Alternative, ...] = ()
     changes: tuple[MappingChange, ...] = ()
-    """The last ones, the newest first."""
+    """The last mappings sent, newest first."""
     gone_s: float | None = None
-    """Since when the robot is gone: all else is what was known last, as of then. None: it is there."""
+    """How long the robot has been gone; everything else is then as last known. None if it is not gone."""
     gone_why: Why | None = None

@@ -1,4 +1,4 @@
-"""What happened in the fleet, and who is gone, as the control plane keeps it for the operator."""
+"""Describes what happened in the fleet and who is gone, as the control plane keeps it for the operator."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ class Why(enum.Enum):
     """Why a sidecar is gone, or as good as gone."""
 
     LEASE_EXPIRED = "lease_expired"
-    """Silent for longer than its lease: it crashed, lost its power, or every way to the control plane."""
+    """Silent for longer than its lease: it crashed, or lost power or every way to the control plane."""
     CERTIFICATE_EXPIRED = "certificate_expired"
     REVOKED = "revoked"
     DRAINED = "drained"
-    """It said goodbye, finished what was in flight, and ended its stream."""
+    """It said goodbye, finished its requests in flight, and ended its stream."""
     LEFT = "left"
-    """It said goodbye, and fell silent before it had finished."""
+    """It said goodbye, but fell silent before it had finished."""
     POLICY = "policy"
-    """It is connected, but the access policy leaves it nobody to talk to."""
+    """It is connected, but the access policy lets it talk to nobody."""
 
 
 class EventKind(enum.Enum):
@@ -31,25 +31,25 @@ class EventKind(enum.Enum):
     STARTED = "started"
     """The control plane."""
     STOPPED = "stopped"
-    """The control plane, in order."""
+    """The control plane, in an orderly shutdown."""
     CONNECTED = "connected"
     STREAM_LOST = "stream_lost"
-    """Its control stream ended; its lease has not."""
+    """Its control stream ended, but not its lease."""
     DEPARTED = "departed"
     REFUSED = "refused"
     """A connection or a registration of a member."""
     NACK = "nack"
-    """It does not take what it was sent."""
+    """It refuses what it was sent."""
     OFFERS_REFUSED = "offers_refused"
-    """It offers what the policy does not let it."""
+    """It offers services that the policy does not allow."""
     UNMET = "unmet"
     """Its configuration names services that nobody serves."""
     POLICY = "policy"
-    """Another policy is in force."""
+    """A new policy is in force."""
     CUT_OFF = "cut_off"
-    """The policy leaves it nobody to talk to."""
+    """The policy lets it talk to nobody."""
     REJOINED = "rejoined"
-    """The policy lets it talk to somebody again."""
+    """The policy lets it talk to others again."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,55 +57,55 @@ class FleetEvent:
     """Something that happened."""
 
     number: int
-    """Only grows, also over restarts."""
+    """Number that only grows, even across restarts."""
     at: float
     """Seconds since 1970, by the control plane's clock."""
     kind: EventKind
     node: NodeName | None = None
-    """Whom it is about; None: the control plane itself."""
+    """The member concerned; None: the control plane itself."""
     text: str = ""
-    """More about it, for people."""
+    """Details, for people."""
     role: Role | None = None
     why: Why | None = None
-    """Of a departure."""
+    """Reason of a departure."""
     seen_at: float | None = None
-    """When one that departed was heard of last, by the same clock."""
+    """When a departed member was last heard from, by the same clock."""
 
 
 @dataclass(frozen=True, slots=True)
 class EventLogState:
-    """How the log of events is doing; what is not in it is counted here."""
+    """State of the event log, with counts of events that are not in it."""
 
     kept: int = 0
     evicted: int = 0
-    """Old ones that made room."""
+    """Old events removed to make room."""
     too_often: int = 0
-    """Not taken: one member had more of them than its share."""
+    """Events not taken because a member had more than its share."""
     damaged: int = 0
-    """Lines of the file that say nothing (any more)."""
+    """Unreadable lines of the file."""
     write_failures: int = 0
     on_disk: bool = False
-    """Whether all of them are."""
+    """Whether all events are on disk."""
     problem: str = ""
-    """Why not, if they should be."""
+    """Why not, if they should be on disk."""
 
 
 @dataclass(frozen=True, slots=True)
 class EventQuery:
-    """Which events are asked for."""
+    """A selection of events."""
 
     node: NodeName | None = None
     after: int = 0
-    """Those with a larger number."""
+    """Only events with a larger number."""
     since: float = 0.0
-    """Not before this time, in seconds since 1970."""
+    """Only events from this time on, in seconds since 1970."""
     last: int = 0
-    """So many of these, the newest; 0: all."""
+    """Only this many of these, the newest; 0: all."""
 
 
 @dataclass(frozen=True, slots=True)
 class EventList:
-    """Events, the oldest first, and how many older ones `last` left out."""
+    """Events, oldest first, and how many older ones `last` left out."""
 
     events: tuple[FleetEvent, ...]
     left_out: int
@@ -114,16 +114,16 @@ class EventList:
 
 @dataclass(frozen=True, slots=True)
 class DepartedSidecar:
-    """One that is gone, and what was known of it last."""
+    """A sidecar that is gone, and what was last known of it."""
 
     name: NodeName
     role: Role
     why: Why
     gone_s: float
-    """Since when."""
+    """How long it has been gone."""
     seen_s: float
-    """Since it said anything."""
+    """Time since it last said anything."""
     text: str = ""
     software_version: str = ""
     services: tuple[ServiceName, ...] = ()
-    """Those that it offered or carried, the first of them."""
+    """The first of the services that it offered or carried."""

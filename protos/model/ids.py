@@ -1,4 +1,4 @@
-"""Names and numbers that both planes speak: typed identifiers and the protocol's version.
+"""Defines the names and numbers that both planes use: typed identifiers and the protocol's version.
 
 Frozen values, without IO and without protobuf. Times are seconds (float), probabilities in [0, 1], unless a name says
 otherwise.
@@ -10,12 +10,11 @@ import enum
 from typing import NewType
 
 PROTOCOL_VERSION = 3
-"""The newest that is spoken here."""
+"""Newest version of the control stream and of the datagram layout spoken here; peers of another version are refused."""
 
 
 OLDEST_PROTOCOL_VERSION = 3
-"""The oldest: the one before the newest. Nothing that spoke 2 was ever let out."""
-"""Version of the control stream and of the datagram layout; peers of another version are refused."""
+"""The oldest version spoken here; normally the one before the newest, but version 2 was never released."""
 
 
 NodeName = NewType("NodeName", str)
@@ -35,7 +34,7 @@ ServiceName = NewType("ServiceName", str)
 
 
 SessionId = NewType("SessionId", int)
-"""64-bit number of one run of a sidecar; stands in the header of every datagram it sends."""
+"""64-bit number of one run of a sidecar, in the header of every datagram it sends."""
 
 
 Version = NewType("Version", int)
@@ -45,11 +44,11 @@ NO_VERSION = Version(0)
 
 
 Address = tuple[str, int]
-"""IP address in its canonical text form and UDP port; IPv4-mapped IPv6 addresses are written as IPv4."""
+"""IP address in canonical text form, and UDP port; IPv4-mapped IPv6 addresses are written as IPv4."""
 
 
 MAX_VERSION = (1 << 63) - 1
-"""Largest version of a resource: half of the field, so that a larger one can always be given out."""
+"""Largest version of a resource: half of the field's range, so that a larger one can always be issued."""
 
 
 class Role(enum.Enum):

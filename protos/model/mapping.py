@@ -1,4 +1,4 @@
-"""Which copies of a service's requests go where.
+"""Describes where the copies of a service's requests go.
 
 Frozen values, without IO and without protobuf. Times are seconds (float), probabilities in [0, 1], unless a name says
 otherwise.
@@ -30,7 +30,7 @@ class ServiceMapping:
     predicted_miss: float = 1.0
     reason: str = ""
     explore: Assignment | None = None
-    """A pair beside the assignments, of which a few requests would teach most; None if nothing is worth it."""
+    """A pair outside the assignments from which a few requests would teach most; None if none is worth it."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,4 +1,4 @@
-"""What is said of the members of the mesh: registrations, peers, services, addresses, revocation lists.
+"""Describes the members of the mesh: registrations, peers, services, addresses, revocation lists.
 
 Frozen values, without IO and without protobuf. Times are seconds (float), probabilities in [0, 1], unless a name says
 otherwise.
@@ -27,19 +27,19 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
 DEFAULT_CHARGE = 1.0
-"""What a request over an interface costs unless said otherwise: so that a service that is to be cheap sends few copies
-where nobody told what they cost."""
+"""Default cost of a request over an interface, so that a service in mode cheapest sends few copies where their cost is
+unknown."""
 
 
 @dataclass(frozen=True, slots=True)
 class InterfaceLabel:
-    """What a robot says of one of its interfaces, for the choice of paths."""
+    """What a robot says about one of its interfaces, for the choice of paths."""
 
     interface: InterfaceName
     carrier: str = ""
-    """Whose network it uses; interfaces with the same one fail together. Empty: not known."""
+    """Carrier whose network it uses; interfaces with the same carrier fail together. Empty if unknown."""
     charge: float = DEFAULT_CHARGE
-    """What a request over it costs, in any one currency."""
+    """Cost of a request over it, in any one currency."""
 
 
 class Copies(NamedTuple):
@@ -49,7 +49,7 @@ class Copies(NamedTuple):
     most: int = 0
 
     def over(self, interfaces: int) -> Copies:
-        """The numbers for so many interfaces."""
+        """Return the numbers for so many interfaces."""
         return Copies(*(min(count or interfaces, interfaces) for count in self))
 
 
@@ -58,11 +58,11 @@ AT_MOST_EVERY_INTERFACE = Copies(least=1)
 
 
 TOKEN_BYTES = 16
-"""Size of the stable secret of a sidecar, and of what each peer is told of it (`protos/trust/pair_token.py`)."""
+"""Size of a sidecar's stable secret, and of the token that each peer gets instead (`protos/trust/pair_token.py`)."""
 
 
 POLICY_PENDING = 0
-"""In place of a policy's fingerprint: nothing is to be judged by it yet, as peers may still be coming back."""
+"""In place of a policy's fingerprint: it must not be applied yet, as peers may still be coming back."""
 
 
 NO_POLICY = 1
@@ -70,7 +70,7 @@ NO_POLICY = 1
 
 
 MAX_CREDENTIAL_BYTES = 2048
-"""Longest encoded session credential: a certificate of some 600 bytes and what is signed beside it."""
+"""Longest encoded session credential: a certificate of some 600 bytes and the rest of what is signed."""
 
 
 MAX_SIGNATURE_BYTES = 72
@@ -78,7 +78,7 @@ MAX_SIGNATURE_BYTES = 72
 
 
 MAX_CANDIDATES_OF_INTERFACE = 8
-"""Addresses under which peers look for one interface: IPv4, some of IPv6, what a NAT makes of each, one advertised."""
+"""Addresses at which peers look for one interface: IPv4, some IPv6, the NAT mapping of each, one advertised."""
 
 
 MAX_PEERS = 4096
@@ -86,7 +86,7 @@ MAX_PEERS = 4096
 
 
 MAX_UNMET = 64
-"""Services told of that a configuration names and nobody serves."""
+"""Reported services that a configuration names but nobody serves."""
 
 
 class CandidateKind(enum.Enum):
@@ -103,14 +103,14 @@ class RemovalReason(enum.Enum):
     LEFT = "left"
     REVOKED = "revoked"
     FORBIDDEN = "forbidden"
-    """It is there, but the access policy leaves the two nothing to do with each other."""
+    """It is there, but the access policy allows the two no contact."""
     EXPIRED = "expired"
-    """Its certificate has ended."""
+    """Its certificate has expired."""
 
 
 @dataclass(frozen=True, slots=True)
 class Candidate:
-    """One address under which one interface of a sidecar may be reached."""
+    """An address at which an interface of a sidecar may be reached."""
 
     interface_id: InterfaceId
     interface: InterfaceName
@@ -126,12 +126,12 @@ class ServiceOffer:
     type: str
     capacity: int = 0
     charge: float = 0.0
-    """What a request costs that it runs, in the currency of the interfaces' charges."""
+    """Cost of a request run there, in the currency of the interfaces' charges."""
 
 
 @dataclass(frozen=True, slots=True)
 class ServiceUse:
-    """A service that a robot sidecar carries right now."""
+    """A service that a robot sidecar carries now."""
 
     name: ServiceName
     type: str
@@ -141,24 +141,24 @@ class ServiceUse:
     target_miss: float = 0.0
     """Above 0: the cheapest mapping that misses the deadline no more often; 0: the most reliable one."""
     fallback_up: bool | None = None
-    """Whether its fallback on the robot itself can be asked; None: it has none."""
+    """Whether its fallback on the robot itself can be called; None: it has none."""
     redundancy: RedundancyMode = RedundancyMode.REPLICATE
-    """Which of the mapped pairs carry a copy, and when: for the prediction."""
+    """Which of the mapped pairs carry a copy, and when; used for the prediction."""
     hedge_quantile: float = DEFAULT_HEDGE_QUANTILE
-    """With RedundancyMode.HEDGE: the share of first copies that is waited for."""
+    """With RedundancyMode.HEDGE: the share of first copies to wait for."""
     budgeted: bool = False
-    """Budgets may keep back all copies but the first one."""
+    """Whether budgets may hold back all copies but the first."""
     wanted_miss: float = 0.0
-    """The share of misses that the configuration allows, also where no mapping is chosen by it; 0: it names none."""
+    """Share of misses that the configuration allows, even if it does not decide the mapping; 0: none named."""
 
 
 @dataclass(frozen=True, slots=True)
 class CallPermit:
-    """Which services a robot may call on the cloud that is told of it; `in` asks for one."""
+    """The services that a robot may call on the cloud that receives this; test one with `in`."""
 
     services: frozenset[ServiceName] = frozenset()
     everything: bool = False
-    """No policy is in force."""
+    """Whether no policy is in force."""
 
     def __contains__(self, service: object) -> bool:
         return self.everything or service in self.services
@@ -181,20 +181,20 @@ class Peer:
     role: Role
     session: SessionId
     token: bytes = field(repr=False)
-    """What it introduces itself with to whoever holds this; inside the control plane its own, which nobody is told."""
+    """Token that introduces it to the holder of this; inside the control plane, its own secret, told to nobody."""
     incarnation: int
     candidates: tuple[Candidate, ...] = ()
     offers: tuple[ServiceOffer, ...] = ()
     draining: bool = False
     credential: bytes = field(default=b"", repr=False)
     may_call: CallPermit = NO_CALLS
-    """Of a robot, told to clouds; nothing unless said otherwise."""
+    """What a robot may call, sent to clouds; nothing by default."""
     candidates_serial: int = 0
     candidates_signature: bytes = field(default=b"", repr=False)
     """As in `CandidateSet`."""
 
     def with_token(self, token: bytes) -> Peer:
-        """Return it with another token, three times as fast as `replace`: a control plane does it 100,000 times."""
+        """Return a copy with another token, three times as fast as `replace`: control planes do this 100,000 times."""
         return Peer(
             self.name,
             self.role,
@@ -230,52 +230,52 @@ class PeerSet:
     policy: int = POLICY_PENDING
     """Fingerprint of the access policy that this set follows, or POLICY_PENDING, or NO_POLICY."""
     base: Version = NO_VERSION
-    """Above 0: `peers` are those that are new or different since this version, and `removed` left since then."""
+    """Above 0: `peers` are new or changed since this version, and `removed` left since then."""
     more: bool = False
-    """The next message goes on with this set."""
+    """Whether the next message continues this set."""
 
 
 @dataclass(frozen=True, slots=True)
 class Registration:
-    """What a sidecar says of itself first on its stream."""
+    """The first message of a sidecar on its stream, about itself."""
 
     protocol_version: int
-    """The oldest that it speaks."""
+    """The oldest version that it speaks."""
     name: NodeName
     role: Role
     session: SessionId
     token: bytes = field(repr=False)
-    """Its own, for the control plane alone."""
+    """Its own secret, for the control plane only."""
     incarnation: int
     software_version: str
     peers_version: Version = NO_VERSION
     mapping_version: Version = NO_VERSION
     credential: bytes = field(default=b"", repr=False)
     region: str = ""
-    """Of a cloud: where it stands; clouds with the same one fail together. Empty: not known."""
+    """Region of a cloud; clouds in the same region fail together. Empty if unknown."""
     incremental: bool = False
-    """It takes changes of its peers, and sets in several messages."""
+    """Whether it accepts changes of its peers, and sets in several messages."""
     newest_protocol_version: int = 0
-    """0: it speaks one alone."""
+    """The newest version that it speaks; 0 if it speaks only one."""
 
 
 @dataclass(frozen=True, slots=True)
 class CandidateSet:
-    """All candidates of a sidecar, with what it says of their interfaces, replacing those it sent before."""
+    """All candidates of a sidecar and what it says about their interfaces, replacing those it sent before."""
 
     candidates: tuple[Candidate, ...] = ()
     labels: tuple[InterfaceLabel, ...] = ()
     serial: int = 0
     """Grows within a session (64 bits)."""
     signature: bytes = field(default=b"", repr=False)
-    """Over candidates, serial and session, for the peers (`candidate_signature`); none in insecure mode."""
+    """Signature over candidates, serial and session, for the peers (`candidate_signature`); none in insecure mode."""
     down: tuple[InterfaceLabel, ...] = ()
-    """Interfaces that it would use and that carry nothing now; for the operator's eyes."""
+    """Interfaces that it would use but that carry nothing now; for the operator only."""
 
 
 @dataclass(frozen=True, slots=True)
 class HeldList:
-    """A revocation list that somebody uses; `ca` is the first 64 bits of the SHA-256 of the CA's certificate."""
+    """A revocation list in use; `ca` is the first 64 bits of the SHA-256 of the CA's certificate."""
 
     ca: int
     number: int
@@ -289,11 +289,11 @@ class RevocationSet:
 
     lists: tuple[HeldList, ...] = ()
     too_old: int = 0
-    """CAs whose list is older than may be, so that their nodes are not talked to."""
+    """Number of CAs whose list is too old, so that their nodes are not talked to."""
 
 
 NO_REVOCATIONS = RevocationSet()
-"""No list, or none told of."""
+"""No list, or none reported."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -303,9 +303,9 @@ class ServiceSet:
     offers: tuple[ServiceOffer, ...] = ()
     uses: tuple[ServiceUse, ...] = ()
     unmet: tuple[ServiceName, ...] = ()
-    """That its configuration names and nobody serves, as far as it knows, at most MAX_UNMET; for the operator."""
+    """Services that its configuration names but nobody is known to serve, at most MAX_UNMET; for the operator."""
     untyped: tuple[ServiceName, ...] = ()
-    """That it cannot carry or offer, as their type is not installed there, at most MAX_UNMET; for the operator."""
+    """Services not carried or offered, as their type is not installed there, at most MAX_UNMET; for the operator."""
     unreached: tuple[ServiceName, ...] = ()
-    """Robot: that its configuration names and servers offer that it knows of, none of which it reaches, at most
+    """Robot: services that its configuration names and known servers offer, none of which it reaches, at most
     MAX_UNMET; for the operator."""

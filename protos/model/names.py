@@ -1,4 +1,4 @@
-"""The names of the mesh and texts for people; a check returns the value or raises DecodeError naming the field."""
+"""Checks names and texts for people; a check returns the value or raises a DecodeError that names the field."""
 
 from __future__ import annotations
 
@@ -9,16 +9,16 @@ from protos.base.errors import DecodeError
 from protos.model.ids import InterfaceName, NodeName, ServiceName
 
 MAX_STRING_BYTES = 255
-"""Longest string, UTF-8: ROS names its limit for topic and service names 255 too."""
+"""Longest string in UTF-8; 255 is also ROS's limit for topic and service names."""
 
 KEPT_NAMES = 16_384
-"""Names remembered as good, of some hundred bytes each: a report repeats the same dozen, each of a fleet's reports."""
+"""Names remembered as good, of some hundred bytes each: every report of a fleet repeats the same dozen."""
 
 # At most 63 characters: such a name fits a certificate's common name (X.520) and a DNS label (RFC 1035).
 _NODE_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,62}")
-# A region or a carrier: stands in reasons and log lines.
+# A region or a carrier, which appears in reasons and log lines.
 _DOMAIN_LABEL = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.&+-]{0,62}")
-# What Linux allows in an interface's name (IFNAMSIZ with the NUL), less what is not printable ASCII.
+# What Linux allows in an interface's name (IFNAMSIZ includes the NUL), restricted to printable ASCII.
 _INTERFACE_NAME = re.compile(r"[!-.0-~]{1,15}")
 # ROS 2: tokens of letters, digits and underscores that do not start with a digit.
 _SERVICE_NAME = re.compile(r"(/[A-Za-z_][A-Za-z0-9_]*)+")
@@ -26,13 +26,13 @@ _TYPE_NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*/(srv|action|msg)/[A-Za-z][A-Za-z
 
 
 def clean_text(text: str) -> str:
-    """`text` on one line, printable and no longer than `MAX_STRING_BYTES`: fit for an error or a reason."""
+    """Return `text` on one line, printable and no longer than `MAX_STRING_BYTES`, fit for an error or a reason."""
     printable = "".join(char if char.isprintable() else " " for char in text)
     return printable.encode("utf-8", "replace")[:MAX_STRING_BYTES].decode("utf-8", "ignore")
 
 
 def text(value: str, field: str) -> str:
-    """Check a text for people: short and printable, so that it breaks neither a log line nor a terminal."""
+    """Check that a text for people is short and printable, so that it breaks neither a log line nor a terminal."""
     if len(value.encode("utf-8", "replace")) > MAX_STRING_BYTES:
         raise DecodeError(f"{field} is longer than {MAX_STRING_BYTES} bytes")
     if not value.isprintable():
@@ -61,7 +61,7 @@ def interface_name(value: str, field: str) -> InterfaceName:
 
 
 def domain_label(value: str, field: str) -> str:
-    """Check the name of a region or a carrier; an empty one means that it is not known."""
+    """Check the name of a region or a carrier; empty means unknown."""
     return value and _name(
         value,
         field,

@@ -1,6 +1,6 @@
-"""Changes of a set of peers: put upon the set that they are for, and put together while neither is on its way.
+"""Applies changes to a set of peers, and merges two changes while neither has been sent.
 
-Changes upon version B that lead to version V: `PeerSet(version=V, base=B, peers=new or different, removed=gone)`.
+Changes from version B to version V: `PeerSet(version=V, base=B, peers=new or different, removed=gone)`.
 """
 
 from __future__ import annotations
@@ -19,20 +19,20 @@ if TYPE_CHECKING:
 
 
 def put_upon(held: Mapping[NodeName, Peer], changes: PeerSet) -> PeerSet:
-    """Return the whole set that these changes make of the peers of their base version; its notices are theirs."""
+    """Return the whole set that these changes make of the peers of their base version, with the changes' notices."""
     peers = dict(held)
     _change(peers, changes)
     return replace(changes, peers=tuple(peers.values()), base=Version(0), more=False)
 
 
 def put_together(first: PeerSet, then: PeerSet) -> PeerSet:
-    """Return one set that does what two do in turn; the base of the second is the version of the first, or 0."""
+    """Return one set with the effect of both in turn; the base of the second is the version of the first, or 0."""
     if not then.base:
         return then
     peers = {peer.name: peer for peer in first.peers}
     _change(peers, then)
     gone = {removed.name: removed for removed in (*first.removed, *then.removed) if removed.name not in peers}
-    # What was judged by one policy stays judged by it while the next one is not to be judged by.
+    # The first policy stays in force while the next one must not be applied yet.
     policy = first.policy if then.policy == POLICY_PENDING else then.policy
     return replace(then, base=first.base, peers=tuple(peers.values()), removed=tuple(gone.values()), policy=policy)
 

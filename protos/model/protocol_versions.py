@@ -1,7 +1,7 @@
-"""Which versions of the protocol a program speaks, and which of them two programs use with each other.
+"""Determines which versions of the protocol a program speaks, and which one two programs use with each other.
 
-Each program speaks the newest that it knows, N, and N-1 beside it, so that a fleet is upgraded in any order. What may
-be added without a new version, since who does not know it leaves it out: docs/develop/protocol.md.
+Each program speaks the newest version that it knows, N, and also N-1, so that a fleet can be upgraded in any order.
+docs/develop/protocol.md says what may be added without a new version, as programs that do not know it ignore it.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ class Spoken(NamedTuple):
     newest: int
 
     def common(self, other: Spoken) -> int | None:
-        """Return the newest that both speak; None if there is none."""
+        """Return the newest version that both speak; None if there is none."""
         newest = min(self.newest, other.newest)
         return newest if newest >= max(self.oldest, other.oldest) else None
 

@@ -1,4 +1,4 @@
-"""How many copies of a service's requests are sent, and when."""
+"""Defines how many copies of a service's requests are sent, and when."""
 
 from __future__ import annotations
 
@@ -26,10 +26,10 @@ class RedundancyMode(enum.Enum):
 
     @property
     def sends_late(self) -> bool:
-        """Whether another copy goes out since the first is, or may be, slow."""
+        """Whether another copy is sent because the first is, or may be, slow."""
         return self in (RedundancyMode.HEDGE, RedundancyMode.ADAPTIVE)
 
     @property
     def helps(self) -> bool:
-        """Whether another copy may go out while one is awaited."""
+        """Whether another copy may be sent while one is awaited."""
         return self is not RedundancyMode.SINGLE

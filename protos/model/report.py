@@ -1,4 +1,4 @@
-"""What a robot measured since its last report.
+"""Describes what a robot measured since its last report.
 
 Frozen values, without IO and without protobuf. Times are seconds (float), probabilities in [0, 1], unless a name says
 otherwise.
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from protos.model.mapping import Assignment
 
 MAX_LATENCIES = 4096
-"""Pairs (interface, server) in one report, counted anew for each service and size class that they carried."""
+"""Pairs (interface, server) in one report, counted separately for each service and size class that they carried."""
 
 
 MAX_PATHS = 4096
@@ -23,7 +23,7 @@ MAX_PATHS = 4096
 
 
 MAX_JOINTS = 1024
-"""Pairs of paths in one report: 16 services, each over 8 interfaces in turn to a few servers. As many of interfaces."""
+"""Pairs of paths in one report: 16 services, each over 8 interfaces in turn to a few servers. Same for interfaces."""
 
 
 MAX_GOODBYES = 64
@@ -36,10 +36,10 @@ MAX_PENALTIES = 1024
 
 @dataclass(frozen=True, slots=True)
 class LatencyReport:
-    """What requests of one service and size class took over one interface to one server since the last report.
+    """Times of requests of one service and size class over one interface to one server since the last report.
 
-    Beside the histograms, which know a time when it is over: how many of `requests` missed the service's deadline,
-    known when that is over.
+    The histograms count a time once it is complete. `missed` counts how many of `requests` missed the service's
+    deadline, which is known once that has passed.
     """
 
     interface: InterfaceName
@@ -48,11 +48,11 @@ class LatencyReport:
     size_class: int
     """See `protos.base.size_class`."""
     network: Histogram
-    """From sending to the answer, without the processing; lost is what the server never had whole."""
+    """Time from sending to the answer, without the processing; lost are requests that the server never had whole."""
     called_off: Histogram
-    """When copies were called off that the server did not have yet: the network takes longer than that."""
+    """Times when copies were called off before the server had them: the network takes longer than that."""
     processing: Histogram
-    """The server's share; lost is what it had and did not answer."""
+    """The server's share of the time; lost are requests that it had but did not answer."""
     requests: int = 0
     missed: int = 0
 
@@ -71,7 +71,7 @@ class PathReport:
 
 @dataclass(frozen=True, slots=True)
 class OutcomeReport:
-    """What became of the requests for one service since the last report."""
+    """Outcomes of the requests for one service since the last report."""
 
     service: ServiceName
     ok: int = 0
@@ -94,15 +94,15 @@ class JointReport:
 class InterfaceJointReport:
     """Requests that went over two interfaces at once since the last report, and how many missed the deadline on both.
 
-    An interface over which no path is up counts as missed. Which one alone a request missed is known of full `races`
-    only, in which no copy is called off before the deadline.
+    An interface over which no path is up counts as missed. On which one alone a request missed is only known for full
+    `races`, in which no copy is called off before the deadline.
     """
 
     service: ServiceName
     first: InterfaceName
     second: InterfaceName
     server: NodeName | None
-    """Of both copies; None for all other requests."""
+    """Server of both copies; None for all other requests."""
     requests: int
     both_missed: int
     races: int
@@ -112,13 +112,13 @@ class InterfaceJointReport:
 
 @dataclass(frozen=True, slots=True)
 class PenaltyReport:
-    """A server whose answers could not be delivered: whatever the mapping says, others go before it."""
+    """A server whose answers could not be delivered: whatever the mapping says, others are preferred."""
 
     server: NodeName
     left_s: float
-    """For how long yet."""
+    """How much longer the penalty lasts."""
     bad_answers: int = 1
-    """That it is penalised for; half of what lies two minutes back."""
+    """Bad answers that it is penalised for; those of two minutes ago count half."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -131,14 +131,14 @@ class Report:
     joints: tuple[JointReport, ...] = ()
     interface_joints: tuple[InterfaceJointReport, ...] = ()
     penalties: tuple[PenaltyReport, ...] = ()
-    """All that are in force."""
+    """All penalties in force."""
     goodbyes: tuple[NodeName, ...] = ()
-    """Servers that said goodbye to this robot and are listed yet, or were until its last report."""
+    """Servers that said goodbye to this robot and are still listed, or were until its last report."""
     changes_only: bool = False
-    """Whether it tells of no other paths than those that went up or down, and of nothing else that was measured."""
+    """Whether it covers only paths that went up or down, and no other measurement."""
     continues: bool = False
-    """Whether this is a further part of a report, which says nothing of penalties."""
+    """Whether this is a further part of a report, which holds no penalties."""
     more: bool = False
     """Whether further parts of the report follow."""
     servers_before: frozenset[NodeName] = frozenset()
-    """Servers of the paths in the parts before this one."""
+    """Servers of the paths in the earlier parts."""

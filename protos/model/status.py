@@ -1,4 +1,4 @@
-"""What the control plane tells an operator of each sidecar."""
+"""Describes what the control plane tells an operator about each sidecar."""
 
 from __future__ import annotations
 
@@ -21,8 +21,10 @@ _NONE_YET = Version(0)
 
 
 class SyncState(enum.Enum):
-    """Whether a sidecar applied what it was sent last. A nack is never shown as synced, and stays one while the same is
-    sent again."""
+    """Whether a sidecar applied what it was last sent.
+
+    A nack is never shown as synced, and stays a nack while the same content is sent again.
+    """
 
     NOT_SENT = "not sent"
     STALE = "stale"
@@ -32,7 +34,7 @@ class SyncState(enum.Enum):
 
 @dataclass(frozen=True, slots=True)
 class ResourceStatus:
-    """How far one resource of one sidecar got; `error` is the detail of the last nack."""
+    """Progress of one resource of one sidecar; `error` is the detail of the last nack."""
 
     version_sent: Version = _NONE_YET
     version_acked: Version = _NONE_YET
@@ -42,9 +44,9 @@ class ResourceStatus:
 
 @dataclass(frozen=True, slots=True)
 class StatusQuery:
-    """Whose status is asked for (nobody named: everybody's), and how many are told in full though they are in order.
+    """Whose status to return (everybody's if no name is given), and how many of those in order to describe in full.
 
-    0: any number.
+    0 means any number.
     """
 
     names: tuple[NodeName, ...] = ()
@@ -53,7 +55,7 @@ class StatusQuery:
 
 @dataclass(frozen=True, slots=True)
 class SidecarStatus:
-    """What the control plane knows of one sidecar, for the operator; its secret token is left out."""
+    """What the control plane knows about one sidecar, for the operator, without its secret token."""
 
     peer: Peer
     connected: bool
@@ -65,19 +67,19 @@ class SidecarStatus:
     services: tuple[ServiceMapping, ...] = ()
     paths: tuple[PathReport, ...] = ()
     refused_offers: tuple[ServiceName, ...] = ()
-    """What it offers and the policy does not let it."""
+    """Services that it offers but the policy does not allow."""
     revocations: RevocationSet = NO_REVOCATIONS
     unmet: tuple[ServiceName, ...] = ()
-    """Services that its configuration names and nobody serves."""
+    """Services that its configuration names but nobody serves."""
     untyped: tuple[ServiceName, ...] = ()
     """Services that it would carry or offer if their type were installed there."""
     unreached: tuple[ServiceName, ...] = ()
-    """Services that its configuration names and servers offer that it knows of, none of which it reaches."""
+    """Services that its configuration names and known servers offer, none of which it reaches."""
     down: tuple[InterfaceName, ...] = ()
-    """Interfaces that it would use and that carry nothing now."""
+    """Interfaces that it would use but that carry nothing now."""
     withdrawn: tuple[ServiceName, ...] = ()
-    """Services that it offered since it registered, does not now, and that its configuration does not name."""
+    """Services that it has offered since it registered, no longer offers, and its configuration does not name."""
     unanswered: Mapping[ServiceName, int] = field(default_factory=dict)
-    """How many requests in a row it had and did not answer, by service; those without any are left out."""
+    """Number of consecutive requests that it had but did not answer, by service; services without any are left out."""
     abridged: bool = False
-    """Its addresses, mapping and paths are left out, as it is in order and one of many."""
+    """Whether its addresses, mapping and paths are left out, as it is in order and one of many."""

@@ -1,4 +1,4 @@
-"""The messages of the control stream beside those sets.
+"""Defines the remaining messages of the control stream.
 
 Frozen values, without IO and without protobuf. Times are seconds (float), probabilities in [0, 1], unless a name says
 otherwise.
@@ -27,19 +27,20 @@ class ResourceKind(enum.Enum):
 
 @dataclass(frozen=True, slots=True)
 class Heartbeat:
-    """Renews the lease, as every other message does."""
+    """A message that renews the lease, as every other message does."""
 
 
 @dataclass(frozen=True, slots=True)
 class Drain:
-    """The sidecar finishes what is in flight and goes."""
+    """The sidecar finishes its requests in flight and leaves."""
 
 
 @dataclass(frozen=True, slots=True)
 class Welcome:
     """The control plane's answer to a registration, sent again when any of it changes.
 
-    `stun_servers` are host:port strings, `crl` what the fleet's CAs have revoked (PEM, signed by them; may be empty).
+    `stun_servers` are host:port strings; `crl` holds the fleet's revocation lists (PEM, signed by its CAs; may be
+    empty).
     """
 
     lease_s: float
@@ -47,7 +48,7 @@ class Welcome:
     stun_servers: tuple[str, ...] = ()
     crl: bytes = field(default=b"", repr=False)
     reconnect_max_s: float = 0.0
-    """The most between two attempts to connect again; 0: not told."""
+    """Longest interval between two attempts to reconnect; 0 if not given."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,7 +62,7 @@ class Ack:
 
 @dataclass(frozen=True, slots=True)
 class Nack:
-    """What was sent with `nonce` is refused; `version` is still in force."""
+    """The content sent with `nonce` is refused; `version` is still in force."""
 
     resource: ResourceKind
     version: Version
@@ -70,8 +71,8 @@ class Nack:
 
 
 SidecarMessage = Registration | CandidateSet | ServiceSet | Report | Ack | Nack | Heartbeat | Drain | RevocationSet
-"""What a sidecar says on its stream; a Registration first, once."""
+"""Messages of a sidecar on its stream: first one Registration."""
 
 
 ControlMessage = Welcome | PeerSet | MappingSet
-"""What the control plane says on a sidecar's stream."""
+"""Messages of the control plane on a sidecar's stream."""

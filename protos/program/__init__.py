@@ -1,1 +1,1 @@
-"""What every program starts with: command line, configuration, log, certificate files, metrics. The only IO here."""
+"""Provides what every program needs: command line, configuration, log, certificates, metrics. No other IO in protos."""

@@ -1,4 +1,4 @@
-"""How all programs read their command lines: a mistake is told in one line, fit for a terminal, with exit code 2."""
+"""Reads the command lines of all programs: a mistake gets one line, safe for a terminal, and exit code 2."""
 
 from __future__ import annotations
 
@@ -19,16 +19,16 @@ EXIT_USAGE = 2
 
 
 class OneLineParser(argparse.ArgumentParser):
-    """Tells of a mistake in one line; so do the parsers of its commands."""
+    """A parser that reports a mistake in one line; so do the parsers of its commands."""
 
     def error(self, message: str) -> NoReturn:
         """Say what is wrong, and end the program."""
-        # A glob names files of others, and argparse repeats what it does not know as it is.
+        # A glob may expand to other users' files, and argparse repeats unknown arguments verbatim.
         self.exit(EXIT_USAGE, escaped(f"{self.prog}: {message}; see {self.prog} --help") + "\n")
 
 
 def checked(check: Callable[[str, str], N], what: str = "the name") -> Callable[[str], N]:
-    """An argument's type: what passes one of the checks of protos/model/names.py; `what` it is begins the error."""
+    """Return an argument type that applies a check of protos/model/names.py; `what` begins the error."""
 
     def parse(text: str) -> N:
         try:
@@ -40,7 +40,7 @@ def checked(check: Callable[[str, str], N], what: str = "the name") -> Callable[
 
 
 def number(least: float, most: float) -> Callable[[str], float]:
-    """Return what reads a number from `least` to `most`, both finite."""
+    """Return an argument type for a number from `least` to `most`, both finite."""
 
     def read(text: str) -> float:
         try:
@@ -55,11 +55,11 @@ def number(least: float, most: float) -> Callable[[str], float]:
 
 
 def whole(least: int, most: int) -> Callable[[str], int]:
-    """Return what reads a whole number from `least` to `most`."""
+    """Return an argument type for a whole number from `least` to `most`."""
     digits = len(str(most))
 
     def read(text: str) -> int:
-        # Python refuses to read thousands of digits, by an error of its own.
+        # Python refuses to read thousands of digits, with an error of its own.
         if not (text.isascii() and text.isdigit() and len(text) <= digits and least <= int(text) <= most):
             raise argparse.ArgumentTypeError(f"expected a whole number from {least} to {most}, got {text!r}")
         return int(text)

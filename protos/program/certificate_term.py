@@ -1,4 +1,4 @@
-"""Whether a node's own certificate is in force, in words for whoever runs the node. Pure: the time is given."""
+"""Says whether a node's own certificate is in force, in words for the operator. Pure: the time is passed in."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from protos.program.tls_files import TlsFiles
 
 SOON_S = 7 * 86_400.0
-"""Before its end, a certificate is warned of for so long; the alert in deploy/prometheus fires as early."""
+"""How long before its end a certificate gets a warning; the alert in deploy/prometheus fires as early."""
 
 _REMEDIES = {
     EXPIRED: "renew it beside the CA, with: plr ca renew {name}, and copy cert.pem and key.pem to the node",
@@ -23,16 +23,16 @@ _REMEDIES = {
 
 @dataclass(frozen=True, slots=True)
 class TermProblem:
-    """What is wrong with a certificate now, or will be soon."""
+    """A problem of a certificate, present or imminent."""
 
     in_force: bool
-    """Peers believe it still."""
+    """Whether peers still accept it."""
     text: str
     """One line: the file, what is wrong, what to do."""
 
 
 def term_problem(files: TlsFiles, now_wall: float) -> TermProblem | None:
-    """Return what the node's owner should know of its certificate at `now_wall` (seconds since 1970), if anything."""
+    """Return what the node's owner should know about its certificate at `now_wall` (seconds since 1970), or None."""
     path, name = files.directory / "cert.pem", files.identity.name
     try:
         files.trust.check(files.certificate_der, now_wall)

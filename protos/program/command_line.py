@@ -1,8 +1,8 @@
-"""plr: hands each command over to whoever has it, and loads nothing else.
+"""Runs plr: dispatches each command to the plane that provides it, and loads nothing else.
 
-The operator's commands are the control plane's, those about the node that one sits at the sidecar's. The planes do not
-import each other, and a robot need not have what the control plane needs: each tells in its entry points
-(`plr.commands` in pyproject.toml) what it has.
+The operator's commands belong to the control plane, those about the local node to the sidecar. The planes do not import
+each other, and a robot need not have what the control plane needs. So each declares its commands as entry points
+(`plr.commands` in pyproject.toml).
 """
 
 from __future__ import annotations
@@ -18,13 +18,13 @@ if TYPE_CHECKING:
 
 GROUP = "plr.commands"
 OPERATOR = "operator"
-"""The entry point of all commands that have none of their own."""
+"""The entry point for all commands that have none of their own."""
 EXIT_FAILURE = 1
 
 
 @endings.ends_quietly("plr")
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the program; returns its exit code."""
+    """Run the program and return its exit code."""
     given = list(sys.argv[1:] if arguments is None else arguments)
     commands = {one.name: one for one in entry_points(group=GROUP)}
     name = given[0] if given and given[0] in commands and given[0] != OPERATOR else OPERATOR

@@ -1,4 +1,4 @@
-"""Which commit this is: written down when a wheel is built, asked of git in a checkout."""
+"""Finds the commit of this code: recorded when a wheel is built, or taken from git in a checkout."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ GIT_TIMEOUT_S = 5.0
 
 @functools.cache
 def commit() -> str | None:
-    """Return the commit, with -dirty if files differ from it; None if nobody knows. Asks git in a checkout."""
+    """Return the commit, with -dirty if files differ from it, or None if unknown; asks git in a checkout."""
     folder = Path(__file__).resolve().parent
     try:
         return (folder / STAMP).read_text().strip() or None
@@ -23,7 +23,7 @@ def commit() -> str | None:
 
 
 def version() -> str:
-    """Return the version of the installed distribution and the commit; what is not known is left out."""
+    """Return the version of the installed distribution and the commit; unknown parts are left out."""
     try:
         release = metadata.version(DISTRIBUTION)
     except metadata.PackageNotFoundError:
@@ -33,10 +33,10 @@ def version() -> str:
 
 
 def _asked_of_git(checkout: Path) -> str | None:
-    # An environment may stand inside another project's checkout, whose commit is not ours.
+    # An environment may lie inside another project's checkout, whose commit is not ours.
     if not (checkout / ".git").exists():
         return None
-    # Root runs a checkout that is somebody else's: git would say nothing, though this very code is run from it.
+    # If root runs another user's checkout, git would refuse to answer, although this very code runs from it.
     git = ("git", "-C", str(checkout), "-c", f"safe.directory={checkout}")
     try:
         done = subprocess.run(  # noqa: S603  (our own words)

@@ -1,4 +1,4 @@
-"""Fields that the configurations of both planes have: addresses, folders, and how they go together."""
+"""Defines the fields common to the configurations of both planes: addresses, folders, and how they go together."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from protos.base.host_port import canonical_ip, check_remote, split_host_port
 
 
 def refuse_duplicates(values: tuple[str, ...]) -> tuple[str, ...]:
-    """Return `values`; raises ValueError when one stands there twice."""
+    """Return `values`; raise ValueError if one occurs twice."""
     for index, value in enumerate(values):
         if value in values[:index]:
             raise ValueError(f"expected each entry once, got {value!r} twice")
@@ -26,7 +26,7 @@ def _check_listen(text: str) -> str:
 
 
 def check_security(tls_dir: Path | None, insecure: bool) -> None:
-    """Check the two keys against each other; raises ValueError that says what was expected."""
+    """Check the two keys against each other; raise a ValueError that says what was expected."""
     if tls_dir is None and not insecure:
         raise ValueError("tls_dir: expected the folder with this node's certificate (see: plr ca issue), but missing")
     if tls_dir is not None and insecure:
@@ -34,7 +34,7 @@ def check_security(tls_dir: Path | None, insecure: bool) -> None:
 
 
 def check_absolute(path: Path) -> Path:
-    """Return `path`; raises ValueError when it is relative, or no path at all."""
+    """Return `path`; raise ValueError if it is relative, or no path at all."""
     if not path.is_absolute():
         raise ValueError(f"expected an absolute path, got '{path}'")
     encoded_path(str(path))
@@ -42,11 +42,11 @@ def check_absolute(path: Path) -> Path:
 
 
 def encoded_path(text: str) -> bytes:
-    """Return what the system is asked for; raises ValueError if nothing can have such a name."""
+    """Return the path as the system gets it; raise ValueError if nothing can have such a name."""
     try:
         name = os.fsencode(text)
     except UnicodeEncodeError:
-        # JSON writes an emoji as two halves, which YAML takes for two characters; a locale may have few characters.
+        # JSON writes an emoji as two surrogates, which YAML reads as two characters; a locale may have few characters.
         raise ValueError(f"expected a path, got one with characters that no name has here: {text!a}") from None
     if b"\0" in name:
         raise ValueError(f"expected a path, got one with a NUL: {text!a}")
@@ -60,13 +60,13 @@ def _refuse_port_alone(value: object) -> object:
 
 
 AbsolutePath = Annotated[Path, AfterValidator(check_absolute)]
-"""A folder: relative to what, a service would not know."""
+"""A folder; for a service, a relative path would be ambiguous."""
 
 TlsDir = AbsolutePath
 """Folder of a node's certificate files."""
 
 RemoteAddress = Annotated[str, AfterValidator(check_remote)]
-"""host:port to talk to."""
+"""host:port to connect to."""
 
 ListenAddress = Annotated[str, BeforeValidator(_refuse_port_alone), AfterValidator(_check_listen)]
 """address:port to listen on, port 0 for any free one."""

@@ -1,6 +1,6 @@
-"""Strict YAML: no key written twice, and every problem as one line that names file, key and expectation.
+"""Reads strict YAML: no key twice, and every problem as one line that names file, key and expectation.
 
-Both planes read their configuration with it. What it costs is bounded: aliases do not multiply, no number is endless.
+Both planes read their configuration with it. Its cost is bounded: aliases do not multiply, and no number is endless.
 """
 
 from __future__ import annotations
@@ -23,10 +23,10 @@ if TYPE_CHECKING:
 Model = TypeVar("Model", bound=BaseModel)
 
 MAX_CONFIG_BYTES = 1 << 20
-"""A configuration is written by hand; a larger file is some other file."""
+"""A configuration is written by hand; a larger file is something else."""
 
 MAX_VALUES = 100_000
-"""In one file, those that an alias repeats counted each time."""
+"""Values in one file; those that an alias repeats count each time."""
 
 _MAX_WHOLE = (1 << 63) - 1
 _MAX_NUMBER_CHARACTERS = 64
@@ -42,11 +42,11 @@ _EXPECTED = {
     "bool_type": "true or false",
     "path_type": "a path",
 }
-"""What the reader of a YAML file calls the kinds of values."""
+"""Names of the kinds of values for the reader of a YAML file."""
 
 
 class _StrictLoader(yaml.SafeLoader):
-    """SafeLoader that refuses too much, and a key written twice, where YAML would silently keep the last one."""
+    """SafeLoader that refuses excessive input, and a key written twice, of which YAML would silently keep the last."""
 
     def get_single_data(self) -> Any:
         node = self.get_single_node()
@@ -87,9 +87,9 @@ _StrictLoader.add_constructor("tag:yaml.org,2002:float", _StrictLoader.number)
 
 
 def _count(node: yaml.Node, known: dict[int, int | None]) -> int:
-    """Return how many values a node stands for, aliases followed; raises ConstructorError for too many, or a circle.
+    """Return how many values a node stands for, aliases followed; raise ConstructorError for too many, or a cycle.
 
-    `known`: those counted before, by their identity, None for one that is being counted.
+    `known` maps the identity of each node counted before to its count, or to None while it is being counted.
     """
     if id(node) in known:
         before = known[id(node)]
@@ -109,13 +109,13 @@ def _count(node: yaml.Node, known: dict[int, int | None]) -> int:
 
 
 def _refuse_long(node: yaml.ScalarNode) -> None:
-    # A long one takes long: PyYAML multiplies the parts of 1:59:59 one by one, and Python refuses to print it.
+    # A long number takes long: PyYAML multiplies the parts of 1:59:59 one by one, and Python refuses to print it.
     if len(node.value) > _MAX_NUMBER_CHARACTERS:
         raise _refused("no number may have more than 64 bits", node)
 
 
 def _refuse_ambiguous(node: yaml.ScalarNode) -> None:
-    """Refuse what YAML 1.1 reads in base 8 or 60, and its reader in base 10: 0123 is 83, 1:30 is 90."""
+    """Refuse what YAML 1.1 reads in base 8 or 60, but people in base 10: 0123 is 83, 1:30 is 90."""
     digits = node.value.lstrip("+-").replace("_", "")
     if ":" in digits or (digits[:1] == "0" and digits[1:2].isdigit()):
         raise _refused(f"write {node.value} without leading zeros or colons, or, if it is text, in quotes", node)
@@ -149,7 +149,7 @@ def parse_yaml(text: str, source: str) -> dict[str, Any]:
         where = f"line {mark.line + 1}" if mark else ""
         raise ConfigError(source, where, f"expected YAML: {error.problem or error.context}") from error
     except (yaml.YAMLError, ValueError, TypeError, LookupError, AttributeError, RecursionError) as error:
-        # The constructors of the YAML package leak these for malformed scalars (!!int x, 2026-02-31).
+        # The constructors of the YAML package leak these errors for malformed scalars (!!int x, 2026-02-31).
         raise ConfigError(source, "", f"expected YAML: {_one_line(str(error))}") from error
     if data is None:
         raise ConfigError(source, "", "expected keys and values, but it is empty; deploy/config has examples")
@@ -175,7 +175,7 @@ def validate(model: type[Model], data: Mapping[str, Any], source: str) -> Model:
 
 
 def key_path(location: Iterable[str | int]) -> str:
-    """Write a location the way a reader finds it: services[0].deadline_ms."""
+    """Return a location in the notation of the file's reader: services[0].deadline_ms."""
     path = ""
     for part in location:
         if isinstance(part, int):
@@ -186,7 +186,7 @@ def key_path(location: Iterable[str | int]) -> str:
 
 
 def _root_problems(problems: list[ErrorDetails]) -> list[ErrorDetails]:
-    """Leave out what is only there because another field or a list's entry has a problem."""
+    """Leave out problems that only follow from one of another field or of a list's entry."""
     parents = {problem["loc"][:length] for problem in problems for length in range(len(problem["loc"]))}
     return [
         problem

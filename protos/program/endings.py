@@ -1,4 +1,4 @@
-"""How our programs end where they are not at fault: by Ctrl-C, when nobody reads what they print, at a full disk."""
+"""Ends our programs cleanly when they are not at fault: on Ctrl-C, with no reader of their output, on a full disk."""
 
 from __future__ import annotations
 
@@ -19,15 +19,15 @@ P = ParamSpec("P")
 
 EXIT_FAILURE = 1
 EXIT_NO_READER = 128 + signal.SIGPIPE
-"""As the shell tells of a program that SIGPIPE ended, ..."""
+"""Exit code that the shell reports for a program ended by SIGPIPE, ..."""
 EXIT_INTERRUPTED = 128 + signal.SIGINT
-"""... or Ctrl-C."""
+"""... or by Ctrl-C."""
 _STDERR = 2
 _NO_ROOM = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO})
 
 
 def ends_quietly(name: str) -> Callable[[Callable[P, int]], Callable[P, int]]:
-    """Decorate a program's main function, which returns its exit code; `name` begins a line of error."""
+    """Decorate a program's main function, which returns its exit code; `name` begins an error line."""
 
     def decorate(main: Callable[P, int]) -> Callable[P, int]:
         @functools.wraps(main)
@@ -38,7 +38,7 @@ def ends_quietly(name: str) -> Callable[[Callable[P, int]], Callable[P, int]]:
                     _answer_ctrl_c()
                     return main(*args, **kwargs)
                 finally:
-                    # Here, where it can be answered for: the interpreter's own at its end prints a traceback.
+                    # Flush here, where errors can be handled: the interpreter's own final flush prints a traceback.
                     sys.stdout.flush()
             except BrokenPipeError:
                 print_no_more()
@@ -59,8 +59,10 @@ def ends_quietly(name: str) -> Callable[[Callable[P, int]], Callable[P, int]]:
 
 @contextlib.contextmanager
 def ended_by_ctrl_c() -> Iterator[None]:
-    """In the block, which has nothing to tidy up, Ctrl-C ends the program as it ends one in C: imports take their time,
-    and Python loses an exception, or prints it, that comes within one."""
+    """Let Ctrl-C end the program as it ends a C program, within a block that has nothing to clean up.
+
+    Imports take time, and Python loses or prints an exception raised within one.
+    """
     ours = threading.current_thread() is threading.main_thread()
     before = signal.signal(signal.SIGINT, signal.SIG_DFL) if ours else None
     try:
@@ -71,15 +73,15 @@ def ended_by_ctrl_c() -> Iterator[None]:
 
 
 def _answer_ctrl_c() -> None:
-    """Ctrl-C is an exception again, which whatever is under way may tidy up after (see `entry`)."""
+    """Make Ctrl-C an exception again, so that running code can clean up (see `entry`)."""
     if threading.current_thread() is threading.main_thread() and signal.getsignal(signal.SIGINT) is signal.SIG_DFL:
         signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 def _have_streams() -> None:
-    """A shell may start us without them (>&-).
+    """Open the standard streams if a shell started us without them (>&-).
 
-    What C libraries print to descriptor 2 would go to the first file or socket that gets the number.
+    Otherwise the output of C libraries to descriptor 2 would go to the first file or socket that gets the number.
     """
     while (descriptor := os.open(os.devnull, os.O_RDWR)) <= _STDERR:
         os.set_inheritable(descriptor, True)
@@ -89,17 +91,17 @@ def _have_streams() -> None:
             setattr(sys, name, open(os.devnull, "w", encoding="utf-8"))
         stream = getattr(sys, name)
         if isinstance(stream, io.TextIOWrapper):
-            # A locale without the character must not end the program: an escape stands for it.
+            # A locale without the character must not end the program: an escape replaces it.
             stream.reconfigure(errors="backslashreplace")
 
 
 def print_no_more() -> None:
-    """Let go what is still to be written and cannot be, by us and by the interpreter at its end."""
+    """Discard output that can no longer be written, by us or by the interpreter at its end."""
     nowhere = os.open(os.devnull, os.O_WRONLY)
     for stream in (sys.stdout, sys.stderr):
         with contextlib.suppress(OSError, ValueError):
             stream.flush()
             continue
-        with contextlib.suppress(OSError, ValueError):  # a test's has no number
+        with contextlib.suppress(OSError, ValueError):  # a test's stream has no descriptor
             os.dup2(nowhere, stream.fileno())
     os.close(nowhere)

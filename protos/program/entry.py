@@ -1,4 +1,4 @@
-"""Where `plr` begins, and how all programs do: before anything else is imported, which takes a fraction of a second."""
+"""Starts `plr`, and prepares all programs before anything else is imported, which takes a fraction of a second."""
 
 from __future__ import annotations
 
@@ -7,25 +7,25 @@ import signal
 
 
 def end_by_ctrl_c() -> None:
-    """From now on Ctrl-C ends the program as it ends one in C, until `program.ends_quietly` answers for it.
+    """Let Ctrl-C end the program as it ends a C program, until `program.endings.ends_quietly` handles it.
 
-    A program that was started with Ctrl-C ignored, as in the background, goes on ignoring it.
+    A program started with Ctrl-C ignored, as in the background, goes on ignoring it.
     """
     if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
         signal.signal(signal.SIGINT, signal.SIG_DFL)
 
 
 def let_the_system_find_names() -> None:
-    """From now on gRPC, which looks at this when it is imported, looks names up as other programs of the host do.
+    """Make gRPC, which reads this when it is imported, resolve names as other programs of the host do.
 
-    Its own resolver asks a name server for the IPv6 address of what stands in /etc/hosts with an IPv4 one, and waits
-    where that server is silent.
+    For a name with only an IPv4 address in /etc/hosts, gRPC's own resolver asks a name server for the IPv6 address, and
+    waits if that server is silent.
     """
     os.environ["GRPC_DNS_RESOLVER"] = "native"
 
 
 def plr() -> int:
-    """Run `plr`; returns its exit code."""
+    """Run `plr` and return its exit code."""
     end_by_ctrl_c()
     let_the_system_find_names()
     from protos.program.command_line import main

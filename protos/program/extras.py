@@ -1,4 +1,4 @@
-"""Which packages a program needs: the distribution's own dependencies, and those of its extra in pyproject.toml."""
+"""Checks for the packages that a program needs: the distribution's dependencies and its extra in pyproject.toml."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _OURS = frozenset({"protos", "sidecar", "controlplane"})
 
 
 def missing(extra: str, modules: Sequence[str]) -> str | None:
-    """Return one line that says what to install, None if all of these modules are there. Imports none of them."""
+    """Return one line that says what to install, or None if all of these modules are there; import none of them."""
     absent = [module for module in (*BASE, *modules) if importlib.util.find_spec(module) is None]
     return advice(extra, absent) if absent else None
 
@@ -34,7 +34,7 @@ def advice(extra: str, absent: Sequence[str]) -> str:
 
 @contextlib.contextmanager
 def required(program: str, extra: str) -> Iterator[None]:
-    """What is imported in the block is there, or the program ends with a line that says what to install."""
+    """End the program with a line that says what to install, if an import in the block fails for a missing package."""
     try:
         with ended_by_ctrl_c():
             yield

@@ -1,7 +1,7 @@
-"""How both programs write a log line: UTC, level, component, text; nothing that a peer says moves a cursor.
+"""Formats the log lines of both programs: UTC, level, component, text; no text of a peer can move a cursor.
 
-To systemd's journal, which notes the time itself, goes a priority in place of it (sd-daemon(3)), so that
-`journalctl -p warning` shows what it should.
+systemd's journal notes the time itself. It gets a priority instead (sd-daemon(3)), so that `journalctl -p warning`
+shows what it should.
 """
 
 from __future__ import annotations
@@ -17,16 +17,16 @@ if TYPE_CHECKING:
     from typing import TextIO
 
 _PRIORITIES = {logging.CRITICAL: 2, logging.ERROR: 3, logging.WARNING: 4, logging.INFO: 6, logging.DEBUG: 7}
-"""syslog(3)'s."""
+"""Priorities of syslog(3)."""
 
 
 def line_formatter(stream: TextIO, own_package: str = "") -> logging.Formatter:
-    """Return what formats lines for this stream; `own_package` is left out before components' names."""
+    """Return the formatter for this stream; `own_package` is left out before components' names."""
     return JournalFormatter(own_package) if is_journal(stream) else LineFormatter(own_package)
 
 
 def is_journal(stream: TextIO) -> bool:
-    """Whether systemd's journal reads the stream: JOURNAL_STREAM says which file that is (systemd.exec(5))."""
+    """Return whether systemd's journal reads the stream: JOURNAL_STREAM identifies its file (systemd.exec(5))."""
     try:
         status = os.fstat(stream.fileno())
     except (OSError, ValueError):
@@ -37,12 +37,12 @@ def is_journal(stream: TextIO) -> bool:
 class LineFormatter(logging.Formatter):
     """2026-01-31T12:00:00.250Z WARNING control_client: text; a traceback follows on indented lines.
 
-    What is not printable is written as an escape, as `repr` does: an escape sequence would move the cursor of whoever
-    reads the log in a terminal, and a line feed would begin a line that looks like one of ours.
+    Unprintable characters are escaped, as `repr` does: an escape sequence would move the cursor of a terminal that
+    shows the log, and a line feed would begin a line that looks like one of ours.
     """
 
     def __init__(self, own_package: str = "") -> None:
-        """`own_package` is left out before the component's name."""
+        """Leave out `own_package` before the component's name."""
         super().__init__()
         self._prefix = f"{own_package}." if own_package else ""
 
@@ -65,7 +65,7 @@ class LineFormatter(logging.Formatter):
 
 
 class JournalFormatter(LineFormatter):
-    """<4>control_client: text; each line with its priority, as the journal makes an entry of each."""
+    """<4>control_client: text; each line has its priority, as the journal makes each an entry."""
 
     def format(self, record: logging.LogRecord) -> str:
         """Return the line."""

@@ -1,7 +1,7 @@
-"""Logging of both programs: one line for each event, with time, level and component, written by a thread of its own.
+"""Sets up logging for both programs: one line per event, with time, level and component, written by its own thread.
 
-A journal or terminal that stalls must not stall the thread that logs: lines wait in a bounded queue, and what does not
-fit is counted and said afterwards.
+A journal or terminal that stalls must not stall the thread that logs. Lines wait in a bounded queue, and those that do
+not fit are counted and reported afterwards.
 """
 
 from __future__ import annotations
@@ -17,14 +17,14 @@ if TYPE_CHECKING:
     from typing import TextIO
 
 MAX_WAITING_LINES = 10_000
-"""About 2 MB: some minutes of a busy log."""
+"""About 2 MB, some minutes of a busy log."""
 
 STOP_TIMEOUT_S = 1.0
-"""What a stalled stream may cost at the end of the program; waiting lines are lost then."""
+"""Time that a stalled stream may cost at the end of the program; waiting lines are then lost."""
 
 
 class _BoundedQueueHandler(QueueHandler):
-    """Never blocks; counts what it drops."""
+    """A handler that never blocks, and counts what it drops."""
 
     def __init__(self, waiting: queue.Queue[logging.LogRecord | None]) -> None:
         super().__init__(waiting)
@@ -32,7 +32,7 @@ class _BoundedQueueHandler(QueueHandler):
         self._dropped = 0
 
     def prepare(self, record: logging.LogRecord) -> logging.LogRecord:
-        # Arguments may change before the line is written, so they are put into the text now.
+        # Arguments may change before the line is written, so the text is formatted now.
         record.msg = record.getMessage()
         record.args = None
         return record
@@ -48,7 +48,7 @@ class _BoundedQueueHandler(QueueHandler):
             self._dropped += 1
 
     def tell_what_was_dropped(self) -> None:
-        """Say it now, if there is something to say and room for it."""
+        """Report dropped lines now, if there are any and there is room for it."""
         if self._dropped:
             with contextlib.suppress(queue.Full):
                 self._waiting.put(self._notice(), timeout=STOP_TIMEOUT_S)
@@ -59,13 +59,13 @@ class _BoundedQueueHandler(QueueHandler):
 
 
 class _PatientListener(QueueListener):
-    """Ends also when its stream has stalled for good."""
+    """A listener that ends even if its stream has stalled permanently."""
 
     def __init__(self, waiting: queue.Queue[logging.LogRecord | None], output: logging.Handler) -> None:
         super().__init__(waiting, output)
         self._waiting = waiting
         self.is_stalled = False
-        """Whether its stream still took nothing when it was stopped."""
+        """Whether its stream was still stalled when it was stopped."""
 
     def stop(self) -> None:
         if self._thread is None:
@@ -78,7 +78,7 @@ class _PatientListener(QueueListener):
 
 
 class Logging:
-    """The program's logging while used as a context: `package` and protos from `level`, libraries from WARNING."""
+    """A context with the program's logging: `package` and protos log from `level` on, libraries from WARNING."""
 
     def __init__(
         self,
@@ -111,7 +111,9 @@ class Logging:
         self._listener.stop()
 
     def end_if_stalled(self, code: int) -> None:
-        """Exit with this code, after the context, if its stream takes nothing more: the thread that hangs in writing
-        holds locks that the interpreter takes at its end."""
+        """Exit with this code, after the context, if its stream has stalled.
+
+        The thread that hangs in a write holds locks that the interpreter takes at its end.
+        """
         if self._listener.is_stalled:
             os._exit(code)

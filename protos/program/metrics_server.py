@@ -1,7 +1,7 @@
-"""Serves /metrics of both programs: few connections at once and none for long, whoever comes.
+"""Serves /metrics of both programs: few connections at once and none for long, whoever the client is.
 
-prometheus_client's own server gives each connection a thread for as long as it likes. Who opens enough of them and says
-nothing takes the program's last file descriptors, without which a sidecar opens no further interface.
+prometheus_client's own server gives each connection a thread for as long as it likes. A client that opens enough of
+them and says nothing takes the program's last file descriptors, and a sidecar can open no further interface.
 """
 
 from __future__ import annotations
@@ -21,11 +21,11 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 MAX_CONNECTIONS = 16
-"""Scrapes at once; a further one is closed unheard."""
+"""Scrapes at once; further connections are closed unread."""
 TIMEOUT_S = 5.0
-"""For each read and write: a scraper over a slow network takes less."""
+"""Limit for each read and write; a scraper over a slow network takes less."""
 RETRY_S = 10.0
-"""From one attempt to have a port that is taken to the next."""
+"""Interval between attempts to get a port that is taken."""
 _STOP_TIMEOUT_S = 1.0
 
 
@@ -46,28 +46,28 @@ class _Server(ThreadingMixIn, WSGIServer):
         super().__init__((host, port), _Handler)
 
     def process_request(self, request: Any, client_address: Any) -> None:
-        """Serve it on a thread, if there is room."""
+        """Serve the request on a thread, if there is room."""
         if self._room.acquire(blocking=False):
             super().process_request(request, client_address)
         else:
             self.shutdown_request(request)
 
     def process_request_thread(self, request: Any, client_address: Any) -> None:
-        """Serve it."""
+        """Serve the request."""
         try:
             super().process_request_thread(request, client_address)
         finally:
             self._room.release()
 
     def handle_error(self, request: Any, client_address: Any) -> None:
-        """A connection that breaks or says nothing is none of the log's business."""
+        """Ignore a connection that breaks or says nothing; it is not worth a log line."""
 
 
 class MetricsServer:
-    """Serves a registry on `host` (an address) from a thread of its own.
+    """Serves a registry on `host` (an address) from its own thread.
 
-    If the port is taken it warns once and tries every `retry_s`: any user of a host can take a port before a program
-    starts, and must not keep a robot without its sidecar by that.
+    If the port is taken it warns once and retries every `retry_s`: any user of a host can take a port before a program
+    starts, and that must not leave a robot without its sidecar.
     """
 
     def __init__(self, host: str, port: int, registry: CollectorRegistry, retry_s: float = RETRY_S) -> None:
@@ -78,7 +78,7 @@ class MetricsServer:
         self._server: _Server | None = None
         self._has_failed = False
         self._changing = threading.Lock()
-        """Its thread may open while another one closes."""
+        """Held while opening or closing: its thread may open while another one closes."""
         self._closing = threading.Event()
         self._open()
         self._thread = threading.Thread(target=self._serve, name="plr-metrics", daemon=True)
@@ -86,13 +86,13 @@ class MetricsServer:
 
     @property
     def port(self) -> int:
-        """The port listened on, also where 0 was asked for; the one asked for while it is taken."""
+        """The port listened on, even if 0 was requested; the requested one while that is taken."""
         server = self._server
         return self._port if server is None else server.server_port
 
     @property
     def is_listening(self) -> bool:
-        """Whether the port was free."""
+        """Whether the port could be opened."""
         return self._server is not None
 
     def _open(self) -> None:
@@ -115,7 +115,7 @@ class MetricsServer:
             log.info("metrics_listen: listens on %s port %d now", self._host, self._port)
 
     def _serve(self) -> None:
-        # Not serve_forever: that looks twice a second whether it should end, and keeps whoever ends it waiting.
+        # Not serve_forever: that checks only twice a second whether it should end, and keeps the caller waiting.
         while not self._closing.is_set():
             if self._server is not None:
                 self._server.handle_request()
@@ -127,7 +127,7 @@ class MetricsServer:
         with self._changing:
             self._closing.set()
         if self._server is not None:
-            # Wakes the thread: on Linux, a socket that listens no more is readable.
+            # This wakes the thread: on Linux, a socket that no longer listens is readable.
             self._server.socket.shutdown(socket.SHUT_RDWR)
         self._thread.join(_STOP_TIMEOUT_S)
         if self._server is not None:

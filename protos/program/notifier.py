@@ -1,4 +1,4 @@
-"""What the programs tell systemd of themselves (sd_notify(3)); without systemd, nothing."""
+"""Tells systemd the state of the program (sd_notify(3)); without systemd it does nothing."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import sdnotify
 
 
 class Notifier:
-    """Never blocks: a status that finds no room is lost, the next one tells as much."""
+    """Sends without blocking: a status that finds no room is lost, and the next one replaces it."""
 
     def __init__(self) -> None:
         self._systemd = sdnotify.SystemdNotifier()
@@ -15,15 +15,15 @@ class Notifier:
         self._status = ""
 
     def ready(self) -> None:
-        """All is started."""
+        """Report that the start is complete."""
         self._systemd.notify("READY=1")
 
     def stopping(self) -> None:
-        """The end has begun."""
+        """Report that the end has begun."""
         self._systemd.notify("STOPPING=1")
 
     def status(self, text: str) -> None:
-        """Show how it is in `systemctl status`, if that is news."""
+        """Show a status in `systemctl status`, if it is new."""
         if text != self._status:
             self._systemd.notify(f"STATUS={text}")
             self._status = text

@@ -1,8 +1,8 @@
-"""A folder of a program's own, by descriptor: what others put beside or in place of it leads nowhere.
+"""Opens a program's own folder by descriptor, so that nothing others put beside it or in its place has any effect.
 
-Under a path in a folder such as /tmp somebody else may have made the folder before, or one above it, with links to what
-he may not write but we may. So the way there is gone step by step, each judged by what was opened, and names in the
-folder are never followed.
+Under a path in a folder such as /tmp, another user may have made the folder before, or one above it, with links to
+files that only we may write. So the path is walked step by step, each step is judged by what was opened, and links in
+the folder are never followed.
 """
 
 from __future__ import annotations
@@ -25,9 +25,9 @@ _MAX_LINKS = 8
 
 
 def refuse_strange(folder: Path, status: os.stat_result, trusted: Container[int] | None = None) -> None:
-    """Raise OSError if others could exchange what is in a folder; in one such as /tmp they can only add to it.
+    """Raise OSError if others could replace what is in a folder; in one such as /tmp they can only add to it.
 
-    `trusted`: who may own it, by default root and this user.
+    `trusted` holds the users who may own it, by default root and this user.
     """
     if status.st_uid not in (trusted or (0, os.geteuid())):
         raise OSError(errno.EPERM, f"{folder} belongs to user {status.st_uid}: chown it, or name a folder of its own")
@@ -36,10 +36,10 @@ def refuse_strange(folder: Path, status: os.stat_result, trusted: Container[int]
 
 
 class OwnFolder:
-    """A folder that belongs to root or this user, made (0700) if it is not there; all methods raise OSError.
+    """A folder that belongs to root or this user, created (0700) if it does not exist; all methods raise OSError.
 
-    The folders above it are judged like it, and made like those of `mkdir -p`. Any of them may be a link that root or
-    this user made, such as /var/run, or those of systemd.
+    The folders above it are judged like it, and created as by `mkdir -p`. Any of them may be a link that root or this
+    user made, such as /var/run or those of systemd.
     """
 
     def __init__(self, path: Path) -> None:
@@ -52,11 +52,11 @@ class OwnFolder:
             raise
 
     def close(self) -> None:
-        """Let it go."""
+        """Release the folder."""
         os.close(self._descriptor)
 
     def open(self, name: str, flags: int) -> int:
-        """Return a descriptor of a file in it, 0600 where `flags` create it; a link, or another user's, is refused."""
+        """Return a descriptor of a file in it, 0600 if `flags` create it; a link, or another user's, is refused."""
         try:
             flags |= os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
             descriptor = os.open(name, flags, 0o600, dir_fd=self._descriptor)
@@ -70,7 +70,7 @@ class OwnFolder:
             os.close(descriptor)
             raise OSError(errno.EPERM, f"{name} belongs to user {owner}: chown or remove it")
         if flags & os.O_CREAT and owner == os.geteuid():
-            # One of an earlier version may be for everybody to read, and so to lock.
+            # A file of an earlier version may be readable, and so lockable, for everybody.
             with contextlib.suppress(OSError):
                 os.fchmod(descriptor, 0o600)
         return descriptor
@@ -80,7 +80,7 @@ class OwnFolder:
         return open(self.open(name, os.O_RDONLY), "rb")
 
     def write(self, name: str, data: bytes) -> None:
-        """Replace a file in it as a whole: a power cut leaves the old one or the new one."""
+        """Replace a file in it as a whole: a power cut leaves either the old or the new one."""
         aside = name + ASIDE_SUFFIX
         self._remove(aside)
         try:
@@ -88,14 +88,14 @@ class OwnFolder:
                 write_through(file, data)
             self.rename(aside, name)
         except OSError:
-            # Half a file takes room on a disk that is full.
+            # Half a file takes up room on a full disk.
             with contextlib.suppress(OSError):
                 self._remove(aside)
             raise
         os.fsync(self._descriptor)
 
     def rename(self, old: str, new: str) -> None:
-        """Give a file in it another name in it."""
+        """Rename a file within the folder."""
         os.replace(old, new, src_dir_fd=self._descriptor, dst_dir_fd=self._descriptor)
 
     def _remove(self, name: str) -> None:
@@ -104,7 +104,7 @@ class OwnFolder:
 
 
 def write_through(file: IO[bytes], data: bytes) -> None:
-    """Write to an unbuffered file, and wait until the disk has it; raises OSError."""
+    """Write to an unbuffered file and wait until the data is on disk; raises OSError."""
     view = memoryview(data)
     while view:
         view = view[file.write(view) :]
@@ -112,8 +112,8 @@ def write_through(file: IO[bytes], data: bytes) -> None:
 
 
 def _open_folder(path: Path) -> int:
-    """Return a descriptor of the folder; whoever owns a folder or a link on the way could lead us elsewhere."""
-    # In a user namespace root's own folders belong to nobody that has a number there, and / is one of them.
+    """Return a descriptor of the folder; check the owners on the way, as any could lead us elsewhere."""
+    # In a user namespace, root's own folders, such as /, belong to a user without a number there.
     trusted = {0, os.geteuid(), os.stat("/").st_uid}
     names = [*reversed(path.absolute().parts)]
     way, here, links = Path("/"), -1, 0
@@ -144,7 +144,7 @@ def _open_folder(path: Path) -> int:
 
 
 def _step(here: int, name: str, mode: int) -> int:
-    """Return a descriptor of what stands under a name in a folder; nothing does: a folder is made."""
+    """Return a descriptor of the entry of this name in a folder; if there is none, create a folder."""
     flags = os.O_PATH | os.O_NOFOLLOW | os.O_CLOEXEC
     if name.startswith("/"):
         return os.open("/", flags)

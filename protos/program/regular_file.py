@@ -1,4 +1,4 @@
-"""Opens what is a file, and waits for nobody: a FIFO or a device in its place is refused."""
+"""Opens regular files without ever blocking: a FIFO or a device in their place is refused."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ if TYPE_CHECKING:
 
 
 def open_regular(path: Path, *, folder: int | None = None) -> BinaryIO:
-    """Open a file to read it; raises OSError, also if it is none, or nothing can have such a name.
+    """Open a file for reading; raise OSError, also if it is no regular file or nothing can have such a name.
 
-    `folder`: the descriptor of the one that a relative path begins in.
+    `folder` is the descriptor of the folder that a relative path starts from.
     """
     try:
-        # A FIFO would be waited for until somebody writes to it.
+        # Without O_NONBLOCK, opening a FIFO would block until somebody writes to it.
         descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC, dir_fd=folder)
     except ValueError as error:
         raise OSError(errno.EINVAL, "there is a NUL in its name") from error
@@ -27,13 +27,13 @@ def open_regular(path: Path, *, folder: int | None = None) -> BinaryIO:
 
 
 def read_regular(path: Path, most: int) -> bytes:
-    """Return what a file holds, its first `most` bytes; raises OSError as `open_regular`."""
+    """Return the first `most` bytes of a file; raises OSError like `open_regular`."""
     with open_regular(path) as file:
         return file.read(most)
 
 
 def refuse_irregular(descriptor: int) -> None:
-    """Close what is no regular file, and raise OSError."""
+    """Close a descriptor of anything but a regular file, and raise OSError."""
     mode = os.fstat(descriptor).st_mode
     if not stat.S_ISREG(mode):
         os.close(descriptor)

@@ -1,4 +1,4 @@
-"""What gRPC's words for a failed TLS connection mean, and what to do about it. Pure: text in, text out."""
+"""Explains gRPC's errors for failed TLS connections, and what to do about them. Pure: text in, text out."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ _SEE_LOG = "its log tells more"
 
 
 def explain(details: str, files: TlsFiles | None, now_wall: float) -> str | None:
-    """Return one line for the operator, or None if TLS has nothing to do with it.
+    """Return one line for the operator, or None if TLS is not the cause.
 
-    `details` is how a connection failed that never came to be, `files` what the client shows (None: insecure) and
-    `now_wall` the time in seconds since 1970.
+    `details` says why a connection was never established, `files` is what the client presents (None: insecure), and
+    `now_wall` is the time in seconds since 1970.
     """
     cut_off = "Socket closed" in details or "recvmsg:" in details
     if files is None:

@@ -1,9 +1,9 @@
-"""A node's folder of TLS files (`tls_dir`): read strictly, and read anew when they change.
+"""Reads a node's folder of TLS files (`tls_dir`) strictly, and again when they change.
 
     cert.pem   the node's certificate
     key.pem    its private key; nobody but the owner may write it, nobody but owner and group may read it
-    ca.pem     the CA, or several while one takes over from the other
-    crl.pem    what the CAs have revoked; may be missing
+    ca.pem     the CA, or several while one replaces another
+    crl.pem    the CAs' revocation lists; may be missing
 
 Both planes read their identity with it; no core does.
 """
@@ -34,10 +34,10 @@ CA_FILE = "ca.pem"
 CRL_FILE = "crl.pem"
 
 POLL_INTERVAL_S = 0.25
-"""How often to look for changes: a revocation has to have its effect within a second."""
+"""How often to look for changes: a revocation must take effect within a second."""
 
 MAX_FILE_BYTES = 4 << 20
-"""A revocation list of some 50,000 certificates; a larger file is some other file."""
+"""A revocation list of some 50,000 certificates; a larger file is something else."""
 
 KEY_FORBIDDEN = stat.S_IRWXO | stat.S_IWGRP
 """Permissions that a node's key must not have; its group may read it, so that it need not belong to the service."""
@@ -54,7 +54,7 @@ _log = logging.getLogger(__name__)
 
 @dataclass(frozen=True, slots=True)
 class TlsFiles:
-    """What a node's TLS files hold. Whether the certificate is in force now is for who uses it to ask `trust`."""
+    """Content of a node's TLS files. To learn whether the certificate is in force now, the user asks `trust`."""
 
     directory: Path
     certificate_pem: bytes
@@ -69,20 +69,20 @@ class TlsFiles:
 
 @dataclass(frozen=True, slots=True)
 class RefusedFiles:
-    """What a folder holds now, and a program that runs does not take."""
+    """The current content of a folder, which a running program refuses."""
 
     why: str
     """One line: the file, what is wrong, what to do."""
     start: bool
-    """Whether a program starts with them: then it does not know the list in use, nor whose certificate was."""
+    """Whether a program would start with them: it then knows neither the list in use nor whose certificate was."""
 
 
 def load_tls_files(directory: Path) -> TlsFiles:
-    """Return the node's identity; raises ConfigError with one line that tells what to do."""
+    """Return the node's TLS files; raise ConfigError with one line that says what to do."""
     try:
         return _load(directory)
     except OSError as error:
-        # A folder that may not be entered, or is replaced while it is looked at.
+        # The folder may not be entered, or was replaced while being read.
         path = str(error.filename or directory)
         hint = _OWNER if isinstance(error, PermissionError) else ""
         raise ConfigError(path, "", f"cannot be read: {error.strerror or error}{hint}") from error
@@ -113,7 +113,7 @@ def _node(directory: Path, trust: Trust, ca_pem: bytes, crl_pem: bytes | None) -
     try:
         (certificate,) = x509.load_pem_x509_certificates(certificate_pem)
     except Exception as error:
-        # Not ValueError alone: a version that does not exist, for one, is another kind.
+        # Not only ValueError: for example, an unknown version raises another kind.
         raise ConfigError(str(path), "", "expected one certificate in PEM; copy the one of plr ca issue") from error
     certificate_der = certificate.public_bytes(Encoding.DER)
     try:
@@ -139,7 +139,7 @@ def _node(directory: Path, trust: Trust, ca_pem: bytes, crl_pem: bytes | None) -
 
 
 def _read(path: Path, forbidden: int) -> bytes:
-    """`read_guarded`, with what to do about a file that is not there or not for us."""
+    """Do the same as `read_guarded`, with advice on a file that is missing or unreadable for us."""
     try:
         return read_guarded(path, forbidden)
     except ConfigError as error:
@@ -151,10 +151,10 @@ def _read(path: Path, forbidden: int) -> bytes:
 
 
 def read_guarded(path: Path, forbidden: int, *, most: int = MAX_FILE_BYTES) -> bytes:
-    """Return what the file holds, `most` bytes; raises ConfigError, also if it has any `forbidden` permission."""
+    """Return the file's content, at most `most` bytes; raise ConfigError, also for any `forbidden` permission."""
     try:
         with open_regular(path) as file:
-            # What was opened is checked, not what stood under the name a moment before.
+            # Check the opened file, not whatever had the name a moment before.
             _refuse_permissions(path, os.fstat(file.fileno()), forbidden)
             data = file.read(most + 1)
     except OSError as error:
@@ -165,7 +165,7 @@ def read_guarded(path: Path, forbidden: int, *, most: int = MAX_FILE_BYTES) -> b
 
 
 def load_private_key(pem: bytes, passphrase: bytes | None, path: Path) -> ec.EllipticCurvePrivateKey:
-    """Return the ECDSA key; raises ConfigError, which names `path`."""
+    """Return the ECDSA key; raise a ConfigError that names `path`."""
     try:
         key = load_pem_private_key(pem, password=passphrase)
     except TypeError as error:
@@ -191,29 +191,29 @@ def _refuse_permissions(path: Path, status: os.stat_result, forbidden: int) -> N
 def _refuse_shared(folder: Path) -> None:
     status = folder.stat()
     if status.st_mode & FORBIDDEN and (status.st_mode & stat.S_ISVTX or status.st_uid not in (0, os.geteuid())):
-        # Such as /tmp, which has to stay so.
+        # A folder such as /tmp, which has to stay writable for everybody.
         problem = "everybody may write there: copy what plr ca issue wrote to a folder of its own, and name that"
         raise ConfigError(str(folder), "", problem)
     _refuse_permissions(folder, status, FORBIDDEN)
 
 
 class TlsWatch:
-    """Holds a node's TLS files and loads them anew when they have changed on disk.
+    """Holds a node's TLS files and reloads them when they have changed on disk.
 
-    Call `poll` every `POLL_INTERVAL_S`. Files that do not fit together keep the old ones in force: while they are being
-    replaced one by one that is nothing unusual, so it is logged only, and once, when they still do not fit at the next
-    look. A certificate is replaced by one of the same node only, a revocation list by a newer one only. A list that
-    came another way counts beside the folder's.
+    Call `poll` every `POLL_INTERVAL_S`. If files do not fit together, the old ones stay in force. That is normal while
+    they are being replaced one by one, so it is logged only if they still do not fit at the next look, and only once.
+    A certificate is only replaced by one of the same node, a revocation list only by a newer one. A list from another
+    source counts in addition to the folder's.
     """
 
     def __init__(self, files: TlsFiles) -> None:
         self.current = files
-        # Unknown, hence different from whatever is there: a change between loading and now is not missed.
         self._relayed = b""
+        # Unknown, so it differs from anything on disk: a change between loading and now is not missed.
         self._seen: _Fingerprint | None = None
         self._broken: _Fingerprint | None = None
         self.refused: RefusedFiles | None = None
-        """Of the folder as it is now, once they did not fit at two looks. Any thread may read it."""
+        """The folder's current files, once they did not fit at two looks. Any thread may read it."""
 
     def poll(self) -> TlsFiles | None:
         """Look once; return the new files if they have changed and are good, else None."""
@@ -236,7 +236,7 @@ class TlsWatch:
         return files if changed else None
 
     def _unlike(self, files: TlsFiles) -> RefusedFiles | None:
-        """What keeps good files from taking the place of those in use."""
+        """Return what keeps good files from replacing those in use, or None."""
         was, new = self.current.identity, files.identity
         if new.role is not was.role or (new.name != was.name and was.role is not IdentityRole.CONTROL_PLANE):
             mine, other = (f"{one.name}, {one.role.value}" for one in (was, new))
@@ -259,7 +259,7 @@ class TlsWatch:
         self._broken = fingerprint
 
     def take_revocations(self, crl_pem: bytes) -> bool:
-        """Believe these lists too, which somebody relayed; whether they say anything new.
+        """Add relayed lists to those in use; return whether they say anything new.
 
         Raises:
             CertificateError: they are malformed, or of no CA of ours.
@@ -284,7 +284,7 @@ class TlsWatch:
 
 
 _Fingerprint = tuple[tuple[int, ...] | None, ...]
-"""What tells the folder, and each file from a later one of the same name; None for one that is not there."""
+"""What distinguishes the folder and each file from a later one of the same name; None for a missing one."""
 
 
 def _fingerprint(directory: Path) -> _Fingerprint:
@@ -293,7 +293,7 @@ def _fingerprint(directory: Path) -> _Fingerprint:
 
 
 def _folder_fingerprint(path: Path) -> tuple[int, ...] | None:
-    """Who may do what with it; not its times, which any other file in it changes."""
+    """Return the folder's inode, owner and permissions, but no times, which any other file in it changes."""
     try:
         status = path.stat()
     except OSError:

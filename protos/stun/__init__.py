@@ -1,1 +1,1 @@
-"""The STUN codec (RFC 8489), for both planes. Imports `base`."""
+"""Provides the STUN codec (RFC 8489) for both planes. Imports `base`."""

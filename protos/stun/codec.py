@@ -1,4 +1,4 @@
-"""STUN Binding codec (RFC 8489), without IO.
+"""Encodes and decodes STUN Binding messages (RFC 8489), without IO.
 
 ::
 
@@ -33,7 +33,7 @@
     |                     reason phrase, UTF-8                      |
     +---------------------------------------------------------------+
 
-Only the Binding method is spoken. Credentials are parsed past, not verified: nothing here relies on them.
+Only the Binding method is supported. Credentials are skipped, not verified: nothing here relies on them.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ TRANSACTION_ID_BYTES = 12
 BINDING_METHOD = 0x001
 
 MAX_MESSAGE_BYTES = 1500
-"""Longest message decoded: one Ethernet MTU. RFC 8489 section 6.1 keeps messages below the path MTU."""
+"""Longest message to decode: one Ethernet MTU. RFC 8489 section 6.1 keeps messages below the path MTU."""
 
 MAX_TEXT_BYTES = 763
 """Longest SOFTWARE and reason phrase (RFC 8489 sections 14.14 and 14.8: 127 characters in UTF-8)."""
@@ -64,7 +64,7 @@ MAX_TEXT_BYTES = 763
 MAX_TEXT_CHARACTERS = 127
 
 MAX_UNKNOWN_ATTRIBUTES = 64
-"""Unknown attribute types kept of one message; a peer of ours has none, and further ones tell nothing new."""
+"""Unknown attribute types kept per message; our peers send none, and further ones add no information."""
 
 _COOKIE_BYTES = MAGIC_COOKIE.to_bytes(4, "big")
 _FINGERPRINT_XOR = 0x5354554E
@@ -122,17 +122,17 @@ class StunMessage:
 
     @property
     def reflexive_address(self) -> Address | None:
-        """Where the server saw the request come from; the XORed form wins: NATs rewrite the plain one."""
+        """Source address of the request as the server saw it; the XORed form wins, as NATs rewrite the plain one."""
         return self.xor_mapped_address or self.mapped_address
 
 
 def is_stun(data: bytes | memoryview) -> bool:
-    """Tell a STUN datagram from the mesh's own by its first bytes, without decoding it."""
+    """Return whether a datagram is STUN rather than the mesh's own, by its first bytes, without decoding it."""
     return len(data) >= HEADER_BYTES and data[0] < 0x40 and data[4:8] == _COOKIE_BYTES
 
 
 def encode(message: StunMessage) -> bytes:
-    """Write a message; raises ValueError where a field does not fit the format (a mistake of the caller)."""
+    """Encode a message; raise ValueError if a field does not fit the format (a mistake of the caller)."""
     if len(message.transaction_id) != TRANSACTION_ID_BYTES:
         raise ValueError(f"transaction id has {len(message.transaction_id)} bytes, expected {TRANSACTION_ID_BYTES}")
     body = bytearray()
@@ -159,7 +159,7 @@ def encode(message: StunMessage) -> bytes:
 
 
 def decode(data: bytes | memoryview) -> StunMessage:
-    """Read a Binding message that fills the datagram exactly; raises DecodeError and nothing else."""
+    """Decode a Binding message that fills the datagram exactly; raise DecodeError and nothing else."""
     data = bytes(data)
     if len(data) < HEADER_BYTES:
         raise DecodeError(f"STUN: {len(data)} bytes, a header has {HEADER_BYTES}")
@@ -183,7 +183,7 @@ def _decode_attributes(data: bytes, message_class: MessageClass, transaction_id:
     while offset < len(data):
         if Attribute.FINGERPRINT in values:
             raise DecodeError("STUN: an attribute follows FINGERPRINT")
-        # The total is a multiple of 4 and every step too, so the 4-byte attribute header is always whole.
+        # The total and every step are multiples of 4, so the 4-byte attribute header is always complete.
         kind, length = _ATTRIBUTE.unpack_from(data, offset)
         start = offset + _ATTRIBUTE.size
         if start + length > len(data):
@@ -226,7 +226,7 @@ def _encode_attribute(kind: Attribute, value: bytes) -> bytes:
 
 
 def _xor(value: bytes, transaction_id: bytes) -> bytes:
-    """Apply or undo the XOR of XOR-MAPPED-ADDRESS to everything behind the family byte."""
+    """Apply or undo the XOR of XOR-MAPPED-ADDRESS on everything after the family byte."""
     mask = bytes(2) + _COOKIE_BYTES[:2] + _COOKIE_BYTES + transaction_id
     return bytes(a ^ b for a, b in zip(value, mask, strict=False)) + value[len(mask) :]
 
@@ -280,7 +280,7 @@ def _read_text(value: bytes | None) -> str | None:
         return None
     if len(value) > MAX_TEXT_BYTES:
         raise DecodeError(f"STUN: text of {len(value)} bytes, at most {MAX_TEXT_BYTES} allowed")
-    # It ends up in logs: no bytes of a stranger may forge lines or move a terminal's cursor there.
+    # The text ends up in logs, where a stranger's bytes must not forge lines or move a terminal's cursor.
     return "".join(c if c.isprintable() else "\ufffd" for c in value.decode(errors="replace"))
 
 

@@ -1,1 +1,1 @@
-"""Who a node is and what it signed: certificates, credentials, tokens. Imports `base` and `model`."""
+"""Establishes who a node is and what it signed: certificates, credentials, tokens. Imports `base` and `model`."""

@@ -1,14 +1,14 @@
-"""What a sidecar announces of its addresses, signed with its certificate's key: a control plane can not add one.
+"""Signs the addresses that a sidecar announces with its certificate's key, so that a control plane cannot add any.
 
 Every announcement of a session has a larger serial than the one before. The signature (ECDSA P-256 with SHA-256, DER)
-is over this, big-endian, texts in ASCII as the model has them::
+covers this, big-endian, with texts in ASCII as in the model::
 
     "plr candidates" | 0 (8) | session (64) | serial (64) | number of candidates (16)
     for each: interface's number (8) | kind (8): 1 host, 2 seen by STUN | port (16)
               length (8) | interface's name | length (8) | IP address
 
-The session's number follows from its owner's name, role and key (`credential.py`), so nobody else's can be signed with
-it. It is never parsed: who verifies it writes it from the candidates it was told.
+The session's number follows from its owner's name, role and key (`credential.py`), so nobody else's session can be
+signed for. These bytes are never parsed: the verifier builds them from the candidates it received.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ def sign_candidates(
 def verify_candidates(
     certificate: bytes, session: SessionId, serial: int, candidates: tuple[Candidate, ...], signature: bytes
 ) -> None:
-    """Check the signature with the certificate (DER) of the session's credential, which is for the caller to judge.
+    """Check the signature with the certificate (DER) of the session's credential, which the caller has to judge.
 
     Raises:
         CertificateError: the certificate's key did not sign this.
@@ -58,12 +58,12 @@ def verify_candidates(
 
 
 def signed_bytes(session: SessionId, serial: int, candidates: tuple[Candidate, ...]) -> bytes:
-    """Return what is signed; other candidates are other bytes."""
+    """Return the bytes to sign; different candidates give different bytes."""
     parts = [_LABEL, _HEAD.pack(session, serial, len(candidates))]
     for candidate in candidates:
         host, port = candidate.address
         parts.append(_CANDIDATE.pack(candidate.interface_id, _KINDS[candidate.kind], port))
-        # A zone (fe80::1%eth0) means nothing elsewhere and does not travel.
+        # A zone (fe80::1%eth0) means nothing elsewhere and is not transmitted.
         for text in (candidate.interface.encode(), host.partition("%")[0].encode()):
             parts += (bytes([len(text)]), text)
     return b"".join(parts)

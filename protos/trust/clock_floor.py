@@ -1,8 +1,8 @@
-"""A time before which this host's clock is not believed: what has expired does not come back when the clock goes back.
+"""Keeps a floor below which this host's clock is not believed, so that setting it back revives nothing expired.
 
 The floor is the newest time that the fleet's CA is known to have signed: when a revocation list or a certificate was
-made. A time counts only if it is not later than the clock says when it is seen. So a clock that jumps to next year and
-back does no lasting harm, nor does a CA whose own clock is ahead; and no peer raises the floor by what it says.
+made. A time counts only if it is no later than the clock when it is seen. So a clock that jumps to next year and back
+does no lasting harm, nor does a CA whose own clock is ahead. No peer can raise the floor by what it says.
 """
 
 from __future__ import annotations
@@ -15,11 +15,11 @@ if TYPE_CHECKING:
     from protos.trust.identity import Trust
 
 SLACK_S = 300.0
-"""A clock that is behind by no more is set a little; `plr ca` lets certificates begin as much in the past."""
+"""A clock behind by no more than this is only corrected slightly; `plr ca` backdates certificates by as much."""
 
 
 class ClockFloor:
-    """Times in seconds since 1970. Any thread may use it."""
+    """The clock with its floor, in seconds since 1970. Any thread may use it."""
 
     def __init__(
         self,
@@ -28,9 +28,9 @@ class ClockFloor:
         remember: Callable[[float], None] | None = None,
         alert: Callable[[str], None] | None = None,
     ) -> None:
-        """`wall` is the host's clock, `floor` what an earlier run left.
+        """Take the host's clock as `wall`, and the `floor` that an earlier run left.
 
-        `remember` is told of each new floor, `alert` once in words when the clock falls behind it.
+        `remember` is called with each new floor, `alert` once with a text when the clock falls behind it.
         """
         self._wall = wall
         self._floor = floor
@@ -40,7 +40,7 @@ class ClockFloor:
 
     @property
     def floor(self) -> float:
-        """The newest time that the CA has signed, as far as is known."""
+        """The newest time that the CA is known to have signed."""
         return self._floor
 
     def now(self) -> float:
@@ -56,14 +56,14 @@ class ClockFloor:
         return max(wall, floor)
 
     def note(self, signed_at: float) -> None:
-        """The CA signed something then."""
+        """Note that the CA signed something at `signed_at`."""
         if self._floor < signed_at <= self._wall():
             self._floor = signed_at
             if self._remember is not None:
                 self._remember(signed_at)
 
     def note_lists(self, trust: Trust) -> None:
-        """The CAs signed these revocation lists."""
+        """Note when the CAs signed these revocation lists."""
         for one in trust.lists().values():
             if one is not None:
                 self.note(one.signed_at)

@@ -1,6 +1,6 @@
-"""What one run of a sidecar says of itself, signed with its certificate's key: peers need believe nobody else.
+"""Encodes what a run of a sidecar says about itself, signed with its certificate's key: peers need trust nobody else.
 
-The control plane relays it as opaque bytes and so can not put another key in between. Layout, big-endian::
+The control plane relays it as opaque bytes, so it cannot substitute another key. Layout, big-endian::
 
     format (8) = 1 | role (8): 1 robot, 2 cloud | AEAD (8): 1 AES-256-GCM, 2 ChaCha20-Poly1305 | length of name (8)
     session (64) | incarnation (64) | X25519 public key (32 bytes) | length of certificate (16)
@@ -8,8 +8,8 @@ The control plane relays it as opaque bytes and so can not put another key in be
     length of signature (8) | signature (ECDSA P-256 with SHA-256, DER, over a label and all that stands before it)
 
 Nothing may follow, so that equal credentials are equal bytes. The session is the first 64 bits of SHA-256 over a label,
-the role (8), the length of the name (8), the name and the public key, 1 for 0: nobody can take a number that is another
-node's, though it stands in clear in every datagram of that one.
+the role (8), the length of the name (8), the name and the public key, with 1 in place of 0. So nobody can take another
+node's number, although it is in clear in every datagram of that node.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ SIGNATURE_ALGORITHM = ec.ECDSA(hashes.SHA256())
 
 
 class Aead(enum.Enum):
-    """A cipher that seals datagrams; the value stands in credentials."""
+    """A cipher that seals datagrams; credentials contain the value."""
 
     AES_256_GCM = 1
     CHACHA20_POLY1305 = 2
@@ -57,7 +57,7 @@ _ROLE_NUMBERS = {role: number for number, role in _ROLES.items()}
 
 @dataclass(frozen=True, slots=True)
 class SessionCredential:
-    """Who a session belongs to, and its key. Without certificate and signature it proves nothing (insecure mode)."""
+    """A session's owner and key. Without certificate and signature it proves nothing (insecure mode)."""
 
     name: NodeName
     role: Role
@@ -72,15 +72,15 @@ class SessionCredential:
 
     @property
     def identity(self) -> bytes:
-        """All that is agreed on: the same for a credential that was signed anew with a renewed certificate."""
+        """The agreed part, which stays the same when the credential is signed again with a renewed certificate."""
         return _head(replace(self, certificate=b"")) + self.name.encode()
 
     def encode(self) -> bytes:
-        """Return the bytes that travel."""
+        """Return the bytes to transmit."""
         return self._signed() + bytes([len(self.signature)]) + self.signature
 
     def sign(self, private_key: ec.EllipticCurvePrivateKey) -> SessionCredential:
-        """Return it signed with the key of its certificate."""
+        """Return a copy signed with the key of its certificate."""
         return replace(self, signature=private_key.sign(_LABEL + self._signed(), SIGNATURE_ALGORITHM))
 
     def _signed(self) -> bytes:
@@ -108,7 +108,7 @@ def _head(credential: SessionCredential) -> bytes:
 
 
 def decode_credential(data: bytes) -> SessionCredential:
-    """Parse a credential; nothing of it is proven yet.
+    """Parse a credential without verifying any of it.
 
     Raises:
         DecodeError: it breaks the layout.
@@ -143,7 +143,7 @@ def verify(credential: SessionCredential, check: Callable[[bytes], Identity]) ->
 
     Raises:
         CertificateError: the certificate is no good, belongs to another name or role, or did not sign this, or the
-            session's number is not its key's.
+            session's number does not match its key.
     """
     identity = check(credential.certificate)
     if identity.name != credential.name or identity.role is not IdentityRole(credential.role.value):
@@ -163,12 +163,12 @@ def signer_key(certificate: bytes) -> ec.EllipticCurvePublicKey:
     """Return the key of a credential's certificate (DER).
 
     Raises:
-        CertificateError: it has none that signs.
+        CertificateError: it has no key that can sign.
     """
     try:
         key = load_der_x509_certificate(certificate).public_key()
     except Exception as error:
-        # As in identity.py: what is wrong inside DER shows as a dozen kinds of errors.
+        # As in identity.py: faults inside DER raise a dozen kinds of errors.
         raise CertificateError(MALFORMED, f"the credential's certificate: {type(error).__name__}") from error
     if not isinstance(key, ec.EllipticCurvePublicKey):
         raise CertificateError(MALFORMED, "the credential's certificate holds no key on P-256")

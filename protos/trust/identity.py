@@ -1,13 +1,13 @@
-"""Who a node is: X.509 certificates of the fleet's CA, and whether to believe one.
+"""Establishes who a node is: X.509 certificates of the fleet's CA, and whether to believe one.
 
-The CA issues leaf certificates directly. Name and role stand in the one URI among the alternative names:
+The CA issues leaf certificates directly. The only URI among the alternative names holds name and role:
 
     subjectAltName = URI:plr://robot/robot-1                                        a node, or an operator
     subjectAltName = URI:plr://controlplane/cp-1, DNS:controlplane.plr.internal     the control plane
 
-Keys are ECDSA on P-256, since gRPC's TLS takes no Ed25519. What is demanded of a certificate is RFC 5280's profile of
-an end entity, narrowed to what the CA issues: one that says more than a node's does is refused. Pure: the time is
-given, nothing is read.
+Keys are ECDSA on P-256, since gRPC's TLS accepts no Ed25519. A certificate must follow RFC 5280's profile of an end
+entity, narrowed to what the CA issues: one that says more than a node's does is refused. Pure: the time is passed in,
+nothing is read.
 """
 
 from __future__ import annotations
@@ -33,18 +33,18 @@ if TYPE_CHECKING:
     from protos.model.ids import NodeName
 
 CONTROL_PLANE_DNS = "controlplane.plr.internal"
-"""The name that every client demands of the control plane's certificate, at whatever address it was reached."""
+"""The name that every client requires in the control plane's certificate, whatever address it was reached at."""
 
 URI_SCHEME = "plr"
 
 MAX_CERTIFICATE_BYTES = 1536
-"""Longest certificate, DER: one that the CA issues has some 500 bytes."""
+"""Longest certificate in DER; one issued by the CA has some 500 bytes."""
 
 MAX_CA_CERTIFICATES = 16
 """CAs trusted at once; a rotation needs two."""
 
 MAX_REVOCATION_LISTS = 64
-"""Lists in one file or message: one for each CA; every one of them may cost a signature check."""
+"""Lists in one file or message: one per CA; each may cost a signature check."""
 
 MALFORMED = "malformed"
 UNTRUSTED = "untrusted"
@@ -65,7 +65,7 @@ _PEM_CRL = re.compile(rb"-----BEGIN X509 CRL-----.*?-----END X509 CRL-----", re.
 
 
 class IdentityRole(enum.Enum):
-    """What a certificate entitles to."""
+    """What a certificate entitles its owner to."""
 
     ROBOT = "robot"
     CLOUD = "cloud"
@@ -86,7 +86,7 @@ class CertificateError(DecodeError):
 
 @dataclass(frozen=True, slots=True)
 class Identity:
-    """Whom a certificate names, and for how long (seconds since 1970, both ends included; never longer than its CA)."""
+    """The owner of a certificate and its validity (seconds since 1970, both ends included; never beyond its CA's)."""
 
     name: NodeName
     role: IdentityRole
@@ -96,7 +96,7 @@ class Identity:
 
 
 def identity_uri(name: str, role: IdentityRole) -> str:
-    """Return the alternative name that stands for a name and role."""
+    """Return the alternative name that represents a name and role."""
     return f"{URI_SCHEME}://{role.value}/{name}"
 
 
@@ -107,7 +107,7 @@ class RevocationList:
     number: int
     signed_at: float
     next_at: float
-    """When the CA wants another to be there: the lists of `plr ca` name the CA's own end."""
+    """When the CA plans the next list; the lists of `plr ca` name the end of the CA itself."""
     pem: bytes = field(repr=False)
 
 
@@ -120,20 +120,20 @@ class _Authority:
 
     @property
     def crl_number(self) -> int:
-        """-1: none."""
+        """Number of the newest list; -1 if there is none."""
         return -1 if self.newest is None else self.newest.number
 
     def digest(self) -> int:
-        """64 bits that stand for the CA."""
+        """Return 64 bits that represent the CA."""
         return int.from_bytes(hashlib.sha256(self.certificate.public_bytes(Encoding.DER)).digest()[:8], "big")
 
 
 class Trust:
     """The CAs to believe and what they have revoked.
 
-    `ca_certificates` is PEM, one CA or several (while one takes over from the other); `crl` is PEM, one list or
-    several; lists of CAs that are not (or no longer) believed count for nothing, but one must be of these. A list does
-    not age: the last one stands until there is a newer. Raises CertificateError where either is not what it should be.
+    `ca_certificates` is PEM, with one CA, or several while one replaces another. `crl` is PEM, with one or more lists.
+    Lists of CAs that are not (or no longer) believed are ignored, but at least one must be of these CAs. A list does
+    not age: the last one is valid until there is a newer one. Raises CertificateError if either argument is wrong.
     """
 
     def __init__(self, ca_certificates: bytes, crl: bytes | None = None) -> None:
@@ -142,7 +142,7 @@ class Trust:
             _load_revocations(crl, self._authorities)
 
     def forgets(self, other: Trust) -> bool:
-        """Whether a list of `other` is missing here or older here: what is revoked there may count as good here."""
+        """Return whether a list of `other` is missing or older here: what is revoked there may count as good here."""
         numbers = {authority.certificate: authority.crl_number for authority in self._authorities}
         return any(
             numbers.get(authority.certificate, authority.crl_number) < authority.crl_number
@@ -150,7 +150,7 @@ class Trust:
         )
 
     def with_revocations(self, pem: bytes) -> Trust:
-        """Return this with further lists; nothing that was revoked is not any more. Raises as the constructor."""
+        """Return a copy with further lists; whatever was revoked stays revoked. Raises like the constructor."""
         wider = Trust.__new__(Trust)
         wider._authorities = tuple(
             _Authority(authority.certificate, authority.key, authority.newest, set(authority.revoked))
@@ -160,31 +160,31 @@ class Trust:
         return wider
 
     def lists(self) -> dict[int, RevocationList | None]:
-        """Return each CA's newest list; the CA as 64 bits of its digest."""
+        """Return each CA's newest list, by 64 bits of the CA's digest."""
         return {authority.digest(): authority.newest for authority in self._authorities}
 
     def crl_pem(self) -> bytes:
-        """Return the newest list of each CA, PEM; empty if there is none."""
+        """Return the newest list of each CA in PEM; empty if there is none."""
         return b"".join(authority.newest.pem for authority in self._authorities if authority.newest is not None)
 
     def too_old(self, now_wall: float, max_age_s: float) -> frozenset[int]:
-        """Return the CAs (digests) of which there is no list that was signed in the last `max_age_s`."""
+        """Return the CAs (digests) without a list signed in the last `max_age_s`."""
         return frozenset(
             authority.digest() for authority in self._authorities if _list_age_s(authority, now_wall) > max_age_s
         )
 
     def revokes(self, serial: int) -> bool:
-        """Whether some list has this serial number: a quick look, which may mean another CA's certificate."""
+        """Return whether any list has this serial number; a quick check, which may hit another CA's certificate."""
         return any(serial in authority.revoked for authority in self._authorities)
 
     def identify(self, certificate_der: bytes) -> Identity:
-        """Return whom a certificate of these CAs names, whatever its age and revocation; raises CertificateError."""
+        """Return whom a certificate of these CAs names, regardless of age and revocation; raise CertificateError."""
         return self._identify(certificate_der)[0]
 
     def check(self, certificate_der: bytes, now_wall: float, max_list_age_s: float = math.inf) -> Identity:
-        """Return whom a certificate names that is good at `now_wall` (seconds since 1970); raises CertificateError.
+        """Return whom a certificate names if it is good at `now_wall` (seconds since 1970), or raise CertificateError.
 
-        Not good either is one whose CA signed no list in the last `max_list_age_s`, as far as is known here.
+        It is not good either if its CA is not known to have signed a list in the last `max_list_age_s`.
         """
         identity, issuer = self._identify(certificate_der)
         if identity.serial in issuer.revoked:
@@ -210,7 +210,7 @@ class Trust:
         except CertificateError:
             raise
         except Exception as error:
-            # What is wrong inside DER shows as a dozen kinds of errors, some only when a field is first looked at.
+            # Faults inside DER raise a dozen kinds of errors, some only when a field is first accessed.
             raise CertificateError(MALFORMED, f"the certificate is malformed: {type(error).__name__}") from error
         issuer = self._issuer(certificate)
         end = min(end, _validity(issuer.certificate)[1])
@@ -218,7 +218,7 @@ class Trust:
 
     def _issuer(self, certificate: x509.Certificate) -> _Authority:
         for authority in self._authorities:
-            # CAs of the same name are told apart by their signature.
+            # CAs of the same name are distinguished by their signature.
             try:
                 certificate.verify_directly_issued_by(authority.certificate)
             except (ValueError, TypeError, InvalidSignature):
@@ -257,7 +257,7 @@ def _list_age_s(authority: _Authority, now_wall: float) -> float:
 
 
 def _load_revocations(pem: bytes, authorities: tuple[_Authority, ...]) -> None:
-    """Note with each CA the serial numbers that it has revoked."""
+    """Note for each CA the serial numbers that it has revoked."""
     blocks: list[bytes] = _PEM_CRL.findall(pem)
     if not blocks:
         raise CertificateError(MALFORMED, "the revocation list is not PEM")
@@ -280,7 +280,7 @@ def _load_revocations(pem: bytes, authorities: tuple[_Authority, ...]) -> None:
         except Exception as error:
             raise CertificateError(MALFORMED, f"the revocation list is malformed: {type(error).__name__}") from error
         if partial:
-            # RFC 5280 section 5.2: a list that is a delta, or about some certificates only, says so critically.
+            # RFC 5280 section 5.2: a delta list, or one about some certificates only, says so in a critical extension.
             raise CertificateError(MALFORMED, "the revocation list is not a complete one")
         for issuer in issuers:
             if number > issuer.crl_number:
@@ -292,7 +292,7 @@ def _load_revocations(pem: bytes, authorities: tuple[_Authority, ...]) -> None:
 
 
 def _check_leaf(certificate: x509.Certificate) -> None:
-    """Check what stands in a certificate beside names and times."""
+    """Check what a certificate contains besides names and times."""
     key = certificate.public_key()
     if not (isinstance(key, ec.EllipticCurvePublicKey) and isinstance(key.curve, ec.SECP256R1)):
         raise CertificateError(MALFORMED, "the certificate's key is not an ECDSA key on P-256")
@@ -312,7 +312,7 @@ def _check_leaf(certificate: x509.Certificate) -> None:
 
 
 def name_and_role(extensions: x509.Extensions, what: str) -> tuple[NodeName, IdentityRole]:
-    """Return whom a certificate or a request (`what` of the two, for the text) names; raises CertificateError."""
+    """Return whom a certificate or a request names; raise CertificateError, whose text calls it `what`."""
     names = list(extensions.get_extension_for_class(x509.SubjectAlternativeName).value)
     uris = [name.value for name in names if isinstance(name, x509.UniformResourceIdentifier)]
     others = [name for name in names if not isinstance(name, x509.UniformResourceIdentifier)]

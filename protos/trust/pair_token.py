@@ -1,11 +1,11 @@
-"""The token by which one sidecar introduces itself to one other, who can forge introductions to nobody else with it.
+"""Derives the token by which a sidecar introduces itself to one peer, which can forge no introductions to others.
 
-Each sidecar has one token of its own, which the control plane alone is told. What a peer holds of it, also on disk,
-follows from that (HKDF-Expand with SHA-256, RFC 5869 section 2.3)::
+Each sidecar has its own token, which only the control plane knows. What a peer holds, also on disk, is derived from it
+(HKDF-Expand with SHA-256, RFC 5869 section 2.3)::
 
     pair token (16 bytes) = Expand(own token, "plr 2 pair token" | receiver's role (8): 1 robot, 2 cloud | its name)
 
-The sidecar derives it for itself, the control plane for every peer whom it tells of the sidecar.
+The sidecar derives it for itself, the control plane for every peer that it tells about the sidecar.
 """
 
 from __future__ import annotations
@@ -26,8 +26,8 @@ _FIRST_BLOCK = b"\1"
 
 
 def pair_token(token: bytes, receiver: NodeName, role: Role) -> bytes:
-    """Return what the owner of `token` introduces itself with to the receiver of this name and role.
+    """Return the token by which the owner of `token` introduces itself to the receiver of this name and role.
 
-    One HMAC in C, 1 to 2 us: to keep it would cost the control plane more than to make it again.
+    It takes one HMAC in C, 1 to 2 us: caching it would cost the control plane more than computing it again.
     """
     return hmac.digest(token, _HEADS[role] + receiver.encode() + _FIRST_BLOCK, "sha256")[:TOKEN_BYTES]

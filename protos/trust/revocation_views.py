@@ -1,4 +1,4 @@
-"""What both programs show of their revocation lists: in metrics, and in the status that an operator asks for."""
+"""Prepares what both programs show of their revocation lists, in metrics and in the operator's status."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ if TYPE_CHECKING:
 
 
 MAX_NUMBER = (1 << 64) - 1
-"""What a message holds; a list's number may be longer (RFC 5280 section 5.2.3)."""
+"""Largest number that fits in a message; a list's number may be longer (RFC 5280 section 5.2.3)."""
 
 
 class RevocationGauge(NamedTuple):
-    """A gauge: its name, what it says, and its value by CA."""
+    """A gauge: its name, its description, and its value by CA."""
 
     name: str
     text: str
@@ -26,7 +26,7 @@ class RevocationGauge(NamedTuple):
 
 
 def revocation_gauges(lists: Mapping[int, RevocationList | None], now_wall: float) -> Iterator[RevocationGauge]:
-    """Yield the gauges; `lists` as of `Trust.lists`, `now_wall` in seconds since 1970."""
+    """Yield the gauges; `lists` is as from `Trust.lists`, `now_wall` in seconds since 1970."""
     held = {(f"{ca:016x}",): one for ca, one in lists.items()}
     yield RevocationGauge(
         "plr_revocation_list_number",
@@ -47,7 +47,7 @@ def revocation_gauges(lists: Mapping[int, RevocationList | None], now_wall: floa
 
 
 def revocation_set(lists: Mapping[int, RevocationList | None], too_old: int = 0) -> RevocationSet:
-    """Return what to tell of these lists; `too_old`: how many CAs have one that is older than may be."""
+    """Return what to report about these lists; `too_old` is the number of CAs whose list is too old."""
     held = [
         HeldList(ca, min(one.number, MAX_NUMBER), int(one.signed_at)) for ca, one in lists.items() if one is not None
     ]
