@@ -165,7 +165,7 @@ class SidecarConfig(Section):
         return tuple(network.budget() for network in self.networks)
 
     def labels(self, interfaces: Iterable[InterfaceName]) -> tuple[InterfaceLabel, ...]:
-        """What is known of these interfaces; those that no entry of `networks` matches are left out."""
+        """Return what is known of these interfaces; those that no entry of `networks` matches are left out."""
         found = []
         for name in dict.fromkeys(interfaces):
             network = self._network(name)
@@ -174,7 +174,7 @@ class SidecarConfig(Section):
         return tuple(found)
 
     def price(self, interface: InterfaceName) -> Price:
-        """What the control stream costs over an interface."""
+        """Return the price of the control stream over an interface."""
         network = self._network(interface)
         if network is None:
             return Price(charge=DEFAULT_CHARGE)
@@ -185,21 +185,21 @@ class SidecarConfig(Section):
 
 
 def load_config(path: Path, identify: Callable[[Path], Identity] | None = None) -> SidecarConfig:
-    """Read and check the file; raises ConfigError. `identify` as of `parse_config`."""
+    """Read and check the file; raise ConfigError on a problem. `identify` is as in `parse_config`."""
     return parse_config(read_text(path), str(path), identify)
 
 
 def parse_config(text: str, source: str, identify: Callable[[Path], Identity] | None = None) -> SidecarConfig:
     """Check YAML text; `source` names it in the error. Raises ConfigError.
 
-    `identify` tells (or raises ConfigError) whom the certificate in a tls_dir names; without it name and role have to
-    stand in the text.
+    `identify` returns whom the certificate in a tls_dir names, or raises ConfigError; without it, the text has to
+    contain name and role.
     """
     data = parse_yaml(text, source)
     folder = data.get("tls_dir")
     if identify is not None and isinstance(folder, str):
         try:
-            # Before name and role are missed that stand in there.
+            # Checked first: without the certificate in it, name and role would be reported as missing.
             check_absolute(Path(folder))
         except ValueError as error:
             raise ConfigError(source, "tls_dir", str(error)) from error
