@@ -80,7 +80,7 @@ class Walk:
         return found, begin
 
     def step(self, steps: int) -> None:
-        """Count so many steps; raise CdrError beyond MAX_STEPS."""
+        """Count `steps` steps; raise CdrError beyond MAX_STEPS."""
         self.steps_left -= steps
         if self.steps_left < 0:
             raise CdrError(f"more than {MAX_STEPS} strings and sequences of different lengths")
@@ -99,7 +99,7 @@ class Walk:
         self.taken(1, MALLOC_BYTES + -(-size // MALLOC_BYTES) * MALLOC_BYTES)
 
     def taken(self, allocations: int, memory: int) -> None:
-        """Count so many allocations with a total of `memory` bytes."""
+        """Count `allocations` allocations with a total of `memory` bytes."""
         self.allocations += allocations
         if self.allocations > MAX_ALLOCATIONS:
             raise CdrError(f"more than {MAX_ALLOCATIONS} strings and sequences")

@@ -268,7 +268,7 @@ class CloudSide:
         for kind, known in endpoints.items():
             for endpoint in known:
                 self._processes.watch(endpoint)  # also those not in use: they may be chosen later
-            # Silence is not enough: a stopped server may have work, and resumes it.
+            # Silence is not enough: a server that hangs may have work, and resumes it.
             if any(is_known and not self._processes.has_ended(endpoint) for endpoint, is_known in known.items()):
                 living.add(kind)
         candidates = living or nodes.keys()
@@ -389,7 +389,7 @@ class CloudSide:
     def _is_alive_since(self, runner: ServiceRunner, since: float) -> bool:
         """Return whether one of its servers lives: its end would have been noticed, or it was heard since `since`.
 
-        A process that was not seen to end may still be stopped: if it answers nothing, it is in doubt.
+        A process that was not seen to end may still hang: if it answers nothing, it is in doubt.
         """
         endpoints = runner.server.endpoints
         in_doubt = runner in self._in_doubt

@@ -1,4 +1,4 @@
-"""Asks the ROS processes of the domain whether they live; a process id shows that one ended, not that it is stopped.
+"""Asks the ROS processes of the domain whether they live; a process id shows that one ended, not that it hangs.
 
 `discovery_topic.py` explains how they are asked.
 """

@@ -2,7 +2,7 @@
 
 Each process keeps its last announcement for later readers (`transient_local`). So a new reader of that topic makes
 each live process send it again. DDS's own threads do so within tens of milliseconds, even while the application is
-busy. A process that was killed or is stopped sends nothing.
+busy. A process that was killed or hangs sends nothing.
 """
 
 from __future__ import annotations

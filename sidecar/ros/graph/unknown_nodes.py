@@ -1,9 +1,9 @@
 """Tracks endpoints whose node rmw does not know, and what their processes answer when asked.
 
-DDS drops a process that stops for longer than its lease, and takes it back when it resumes: in a paused virtual
+DDS drops a process that hangs for longer than its lease, and takes it back when it resumes: in a paused virtual
 machine, under a debugger, on a starved host. But what the process announced about its nodes is not delivered again
 (Fast DDS believes it was). So rmw shows its endpoints as those of an unknown node until the process announces something
-new. A process that was stopped itself sees all others like this.
+new. A process that hung itself sees all others like this.
 
 When a process starts, its endpoints also belong to an unknown node for some milliseconds; so nothing is asked at once.
 """
@@ -22,7 +22,7 @@ MAX_PAUSE_S = 60.0
 """Longest pause between calls for an endpoint that nobody names, such as a non-ROS program's; it doubles up to this."""
 MAX_PARTICIPANTS = 128
 """Participants with endpoints of unknown nodes. A domain has up to 120 on one host, and all of them are unknown if it
-was our process that stopped."""
+was our process that hung."""
 MAX_ENDPOINTS = 512
 """Endpoints of each participant."""
 
