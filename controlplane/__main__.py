@@ -55,7 +55,7 @@ log = logging.getLogger("controlplane")
 
 @endings.ends_quietly("plr-controlplane")
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the program; returns its exit code."""
+    """Run the program and return its exit code."""
     arguments = _parser().parse_args(argv)
     lacking = extras.missing("controlplane", extras.CONTROL_PLANE)
     if lacking is not None:
@@ -79,12 +79,11 @@ def main(argv: Sequence[str] | None = None) -> int:
         sys.stdout.write(f"{escaped(str(arguments.config))}: ok\n")
         return EXIT_OK
     logging.getLogger("grpc._cython.cygrpc").addFilter(_is_not_a_lost_stream)
-    # Not on the loop's thread: a terminal that is stopped would stop the whole fleet's control plane.
+    # Write the log off the loop's thread: a stopped terminal would otherwise stop the whole fleet's control plane.
     logs = Logging("controlplane", config.log_level, sys.stderr, line_formatter(sys.stderr))
     with logs:
         if problem is not None:
-            # It starts all the same: a clock is set soon after a boot, and a certificate is read anew when it is
-            # replaced.
+            # Start all the same: the clock is set soon after boot, and a replaced certificate is read again.
             log.log(logging.WARNING if problem.in_force else logging.ERROR, "%s", problem.text)
         code = _serve(arguments.config, config, files)
     logs.end_if_stalled(code)
@@ -92,7 +91,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _warn_of_what_is_legal(config: ControlPlaneConfig) -> None:
-    """Say what the log of a start would warn of: a policy that allows nothing is legal, and locks a fleet out."""
+    """Print what a start would log as warnings: a policy that allows nothing is legal, and locks a fleet out."""
     from controlplane.config.policy_reload import doubt
 
     warnings = [None if config.policy is None else doubt(config.policy.policy())]
@@ -103,7 +102,7 @@ def _warn_of_what_is_legal(config: ControlPlaneConfig) -> None:
 
 def _serve(source: Path, config: ControlPlaneConfig, files: TlsFiles | None) -> int:
     _take_descriptors()
-    # gRPC takes half a second to import, which checking a configuration need not wait for.
+    # Importing gRPC takes half a second; checking a configuration need not wait for that.
     from controlplane.serve.server import StartError
 
     try:
@@ -138,13 +137,13 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _take_descriptors() -> None:
-    """Have as many files open as the system lets us: a sidecar takes three, and a shell gives 1,024 at first."""
+    """Raise the limit on open files to the system's maximum: a sidecar takes three, and a shell allows only 1,024."""
     _, most = resource.getrlimit(resource.RLIMIT_NOFILE)
     resource.setrlimit(resource.RLIMIT_NOFILE, (most, most))
 
 
 def _is_not_a_lost_stream(record: logging.LogRecord) -> bool:
-    """gRPC writes a traceback when a client goes while its call is being ended, which anybody can make happen."""
+    """Drop gRPC's traceback for a client that leaves while its call is being ended: any client can provoke it."""
     return not record.getMessage().startswith("ExecuteBatchError raised in core")
 
 

@@ -1,4 +1,4 @@
-"""Where plr-controlplane begins."""
+"""Starts plr-controlplane."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from protos.program.entry import end_by_ctrl_c
 
 
 def main() -> int:
-    """Run the program; returns its exit code."""
+    """Run the program and return its exit code."""
     end_by_ctrl_c()
     from controlplane.__main__ import main
 

@@ -1,4 +1,4 @@
-"""Drives the core: its timers, the solver in a thread, and what goes to the streams. No protocol decisions here."""
+"""Drives the core: runs its timers, solves in a thread, and fills the streams. No protocol decisions here."""
 
 from __future__ import annotations
 
@@ -63,34 +63,34 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 MAX_SERVICES_LOGGED = 8
-"""Services named in one log line."""
+"""Services that one log line names at most."""
 
 ENDED_LINES_BURST = 20.0
-"""Log lines at once on streams that were ended for breaking the rules, and on messages left out, of all members."""
+"""Burst of log lines, over all members, on streams ended for breaking the rules and on messages left out."""
 
 CAPACITY_LINE_EVERY_S = 60.0
 ENDED_LINES_PER_S = 1.0
-"""After that."""
+"""Rate of these lines after the burst."""
 
 METRICS_INTERVAL_S = 1.0
-"""How old what is scraped may be: Prometheus scrapes every few seconds at most."""
+"""Maximum age of scraped values: Prometheus scrapes every few seconds at most."""
 
 FLEET_TIMEOUT_S = 4.0
-"""For all of them: a scrape waits no longer, and Prometheus not much."""
+"""Longest wait for the views of all members: a scrape waits no longer, and Prometheus not much longer."""
 
 
 URGENT_LIMIT_S = 0.1
-"""For the solver, where a mapping is urgent: what is not proven to be the best by then waits for the next routine
-solving, not for who makes many of these urgent."""
+"""Time limit of the solver when a mapping is urgent. What is not proven optimal by then waits for the next routine
+solving, so a client that makes many mappings urgent does not delay it."""
 
 URGENT_LIMIT_EACH_S = 250e-6
-"""The same for large fleets, by a service of a robot: to set them out alone takes a part of it."""
+"""The same limit for large fleets, for each service of a robot: stating the problem alone takes a part of it."""
 
 
 def wall_clock_epoch() -> int:
-    """Where versions start: seconds since 1970, with 2^20 versions left for each.
+    """Return the version to start from: seconds since 1970, with room for 2^20 versions in each.
 
-    Below 2^53, so that metrics (doubles) tell one version from the next.
+    It stays below 2^53, so that metrics (doubles) tell one version from the next.
     """
     return time.time_ns() // 1_000_000_000 << 20
 
@@ -108,7 +108,7 @@ class Used:
     at: float
 
     def share(self, processor_s: float, now: float) -> float | None:
-        """The share of one core since the last look; None if that was a moment ago."""
+        """Return the share of one core used since the last call; None if that was a moment ago."""
         passed_s = now - self.at
         if passed_s < METRICS_INTERVAL_S / 2:
             return None
@@ -118,18 +118,18 @@ class Used:
 
 
 QUIET_SHARE, QUIET_LOOKS = 0.5, 5
-"""The loop's share of one core, and how many looks in a row it is below, until there is time for what can wait."""
+"""Share of one core, and how many times in a row the loop must use less before deferrable work begins."""
 
 
 class _LateMatcher:
-    """The matcher, for the solver's thread alone: after a restart the streams need not wait for its modules."""
+    """The matcher, for the solver's thread alone, imported late: after a restart no stream waits for its modules."""
 
     def __init__(self) -> None:
         self._matcher: Matcher | None = None
 
     @staticmethod
     def prepare() -> None:
-        """Import what few problems need."""
+        """Import the modules that few problems need."""
         from controlplane.solver import cp_sat
 
         cp_sat.prepare()
@@ -159,32 +159,32 @@ class ControlLoop:
         self._earliest_end = EarliestEnd()
         self._superseded = 0
         self.turns = Turns()
-        """For whatever takes long."""
+        """Turns for all long work."""
         self.revocations = NO_REVOCATIONS
-        """The lists in use here."""
+        """The revocation lists in use here."""
         self._wake = asyncio.Event()
         self._ended_lines = TokenBucket(rate=ENDED_LINES_PER_S, burst=ENDED_LINES_BURST, now=self._loop.time())
         self._stopping = False
         self._closing = False
-        """Whether streams end since the control plane does."""
+        """Whether streams end because the control plane stops."""
         self._matcher = _LateMatcher()
         self._quiet_looks = 0
-        """Since the loop was last busy; at QUIET_LOOKS the solver is ready."""
+        """Quiet measurements since the loop was last busy; at QUIET_LOOKS the solver is prepared."""
         self._executor = concurrent.futures.ThreadPoolExecutor(1, thread_name_prefix="solver")
         self._exceeded = 0
-        """By how many interfaces capacities are exceeded, as the log has it."""
+        """Interfaces beyond the capacities, as last logged."""
         self._exceeded_line_at = 0.0
         self._garbage = Collector()
         self.report_shares = ReportShares()
         self._lines = LineShare()
         self.stun_servers: list[StunServer] = []
         self.has_unread: Callable[[NodeName, float], bool] = lambda name, since: False
-        """Whether something of a member is there that came later than what was read of it at this time."""
+        """Tells whether data of a member has arrived that nobody can have read by the given time."""
 
     # ── for the streams ──
 
     def register(self, registration: Registration, caller: Caller | None) -> tuple[StreamId, Mailbox] | Refusal:
-        """Begin a stream; returns what to write to it, or why it is refused. `caller` is None in insecure mode."""
+        """Begin a stream; return it with its mailbox, or the refusal. `caller` is None in insecure mode."""
         if caller is None:
             refusal = check_unproven_claims(registration)
         else:
@@ -217,12 +217,12 @@ class ControlLoop:
         return result, mailbox
 
     def receive(self, stream: StreamId, message: SidecarMessage) -> None:
-        """One message of a stream; raises DecodeError if it has no place there."""
+        """Handle one message of a stream; raises DecodeError if it has no place there."""
         self._core.receive(stream, message, self._loop.time())
         self._dispatch()
 
     def disconnected(self, stream: StreamId) -> None:
-        """A stream ended."""
+        """Handle the end of a stream."""
         mailbox = self._mailboxes.pop(stream, None)
         if mailbox is not None:
             self._superseded += mailbox.superseded
@@ -230,24 +230,24 @@ class ControlLoop:
         self._dispatch()
 
     def names(self) -> list[NodeName]:
-        """Every registered sidecar's, in order."""
+        """Return the names of all registered sidecars, sorted."""
         return sorted(sidecar.name for sidecar in self._core.registry)
 
     def status(self, name: NodeName, *, abridged: bool) -> bytes:
-        """One registered sidecar as part of a GetStatusResponse, encoded; empty if it is not there (any more)."""
+        """Return one registered sidecar as an encoded part of a GetStatusResponse; empty if it is not registered."""
         return status_to_proto(self._core.status(self._loop.time(), (name,), abridged=abridged)).SerializeToString()
 
     @property
     def departed(self) -> Departed:
-        """Who is gone."""
+        """The sidecars that are gone."""
         return self._core.departed
 
     def now(self) -> float:
-        """The time of the core: monotonic seconds."""
+        """Return the time of the core in monotonic seconds."""
         return self._loop.time()
 
     def ask_fleet(self) -> Fleet:
-        """What is known of each member; for other threads. Raises TimeoutError if the loop is busy, or has ended."""
+        """Return what is known of each member, for other threads; raises TimeoutError if the loop is busy or ended."""
         gathering = self.gather_fleet()
         try:
             future = asyncio.run_coroutine_threadsafe(gathering, self._loop)
@@ -262,7 +262,7 @@ class ControlLoop:
             future.cancel()
 
     async def gather_fleet(self) -> Fleet:
-        """The same, on the loop, in turns."""
+        """Return the same, on the loop, in turns."""
         views: list[MemberView | None] = []
         async for found in self.turns.each(self.names(), lambda name: self._core.view(name, self._loop.time())):
             views += found
@@ -272,16 +272,16 @@ class ControlLoop:
         return Fleet(members, self._core.departed.told(now, MAX_GONE), ends, now, time.time())
 
     def status_line(self) -> str:
-        """Return in a few words how it is, for `systemctl status`."""
+        """Return the state in a few words, for `systemctl status`."""
         counts = Counter(sidecar.role for sidecar in self._core.registry)
         return f"sidecars connected: {counts[Role.ROBOT]} of robots, {counts[Role.CLOUD]} of clouds"
 
     def explain(self, robot: NodeName, service: ServiceName) -> Explanation:
-        """Why requests go where they go. Raises UnknownNameError if the robot, or its service, is not known."""
+        """Explain why requests go where they go; raises UnknownNameError if the robot or its service is unknown."""
         return self._core.explain(robot, service, self._loop.time())
 
     def set_policy(self, policy: Policy | None) -> None:
-        """Another policy is in force from now on."""
+        """Put another policy into force."""
         rules = f"rules for calls {len(policy.calls)}, for offers {len(policy.offers)}" if policy else "none"
         self.events.record(EventKind.POLICY, text=rules)
         self._core.set_policy(policy, self._loop.time())
@@ -338,7 +338,7 @@ class ControlLoop:
         self._wake.set()
 
     def _say(self, level: int, member: str, text: str, *values: object, of_all: TokenBucket | None = None) -> None:
-        """Log a line that a member causes, as often as it wants, within its share of lines, and that of all."""
+        """Log a line that a member can cause at will, within its share of lines and that of all members."""
         left_out = self._lines.take(member, self._loop.time(), of_all)
         if left_out:
             text, values = f"{text} (%d lines on it were left out before)", (*values, left_out)
@@ -349,14 +349,14 @@ class ControlLoop:
         sidecar = self._core.registry.get(name)
         self.events.record(kind, name, text, role=sidecar.role if sidecar is not None else None)
 
-    # ── for who watches the certificates ──
+    # ── for the watch on certificates ──
 
     def serials(self) -> list[tuple[NodeName, int]]:
-        """Who has proved who it is, and the serial number of the certificate that did."""
+        """Return the members that have proved their identity, with the serial numbers of their certificates."""
         return [(name, caller.identity.serial) for name, caller in self._callers.items()]
 
     def review(self, name: NodeName, trust: Trust, now_wall: float) -> None:
-        """Part with a sidecar whose certificate is not good any more; `now_wall` is seconds since 1970."""
+        """Part with a sidecar whose certificate is no longer valid; `now_wall` is seconds since 1970."""
         caller = self._callers.get(name)
         if caller is None:
             return
@@ -367,13 +367,13 @@ class ControlLoop:
             self._dispatch()
 
     def relay_revocations(self, crl: bytes, held: RevocationSet) -> None:
-        """Tell every sidecar, now and later, what is revoked (PEM), and the operator which lists these are."""
+        """Send every present and future sidecar the revocation lists (PEM), and tell the operator which these are."""
         self.revocations = held
         self._core.relay_revocations(crl, self._loop.time())
         self._dispatch()
 
     def ended(self, now_wall: float) -> list[NodeName]:
-        """Whose certificates have ended."""
+        """Return the members whose certificates have expired."""
         in_use = ((name, caller.identity.not_after) for name, caller in self._callers.items())
         return self._earliest_end.ended(in_use, now_wall)
 
@@ -392,15 +392,15 @@ class ControlLoop:
         self._metrics.refused_connection(reason)
 
     def unknown_message(self, who: str, problem: str, *, again: bool) -> None:
-        """Count a message that was left out; `again`: not the first of its stream, whose line stands in the log."""
+        """Count a message that was left out; `again` means the stream already has a log line about one."""
         self._metrics.unknown_messages.inc()
         if not again:
             self._say(logging.INFO, who, "stream of %s: left out %s", who, problem, of_all=self._ended_lines)
 
     def stream_ended(self, who: str, address: str, code: str, details: str) -> None:
-        """A stream was ended by us; `who` is the member, if that is known, and `address` where it came from."""
+        """Count and log a stream that we ended; `who` is the member, or else its `address`, where it came from."""
         self._metrics.streams_ended.labels(code).inc()
-        # A member that breaks the rules as often as it can must not fill the disk; the counter tells how often.
+        # A member that keeps breaking the rules must not fill the disk; the counter shows how often it did.
         self._say(
             logging.WARNING,
             who,
@@ -438,18 +438,18 @@ class ControlLoop:
                     metrics_at = now + METRICS_INTERVAL_S
                 self._dispatch_quietly()
                 self._garbage.set_aside(now)
-                # What takes several turns takes half of the loop's time at most: streams have the other half.
+                # Work spread over several turns takes half of the loop's time at most: streams have the other half.
                 next_at = max(self._core.next_timer() or metrics_at, self._loop.time() + drawn_s)
                 await self._sleep_until(min(metrics_at, next_at))
         self._executor.shutdown()
 
     def _unread(self, now: float) -> set[NodeName]:
-        """Of those whose lease has ended, whose bytes have arrived: a late loop must cost nobody the lease."""
+        """Return the members with an ended lease whose bytes have arrived: a late loop must cost nobody the lease."""
         registry = self._core.registry
         return {name for name in registry.due(now) if self.has_unread(name, registry.heard_at(name, now))}
 
     def _prepare_if_quiet(self, share: float | None) -> None:
-        """Not at the start at once: a fleet that comes back needs the processor."""
+        """Prepare the solver once the loop is quiet: right after a start a returning fleet needs the processor."""
         if share is None or self._quiet_looks >= QUIET_LOOKS:
             return
         self._quiet_looks = self._quiet_looks + 1 if share < QUIET_SHARE else 0
@@ -457,7 +457,7 @@ class ControlLoop:
             self._executor.submit(self._matcher.prepare)
 
     def _dispatch_quietly(self) -> None:
-        """Dispatch what the loop itself caused, without waking it for that."""
+        """Dispatch what the loop itself caused, without waking it again."""
         self._dispatch()
         self._wake.clear()
 
@@ -473,7 +473,7 @@ class ControlLoop:
         try:
             settled = await self._loop.run_in_executor(self._executor, self._solve_and_settle, picture)
         except Exception:
-            # The plan in force goes on; one failed solving must not take the streams down.
+            # The plan stays in force; one failed solving must not take the streams down.
             log.exception("solving failed; the plan in force stays")
             self._core.solving_failed(self._loop.time())
             return
@@ -483,14 +483,14 @@ class ControlLoop:
         self._dispatch()
 
     def _tell_of_capacities(self) -> None:
-        """A fleet that changes all the time has another figure after each solving."""
+        """Log exceeded capacities at a limited rate: in a changing fleet the figure differs after each solving."""
         exceeded, now = self._core.plan.relaxed, self._loop.time()
         if exceeded != self._exceeded and now >= self._exceeded_line_at:
             self._exceeded, self._exceeded_line_at = exceeded, now + CAPACITY_LINE_EVERY_S
             log.warning("capacities are exceeded by %d interfaces in all", exceeded)
 
     def _solve_and_settle(self, picture: Picture) -> Settled:
-        """On the solver's thread."""
+        """Solve and settle, on the solver's thread."""
         limit_s = self._config.solver_time_limit_ms / 1000
         if not self._core.solves_routinely:
             limit_s = min(limit_s, max(URGENT_LIMIT_S, URGENT_LIMIT_EACH_S * len(picture.problem.blocks)))
@@ -498,12 +498,12 @@ class ControlLoop:
         return self._core.settle(picture, plan, self._loop.time())
 
     def update_metrics(self) -> None:
-        """Leave the values of this moment for whoever scrapes."""
+        """Publish the current values for the next scrape."""
         superseded = self._superseded + sum(mailbox.superseded for mailbox in self._mailboxes.values())
         self._metrics.update(self._core, self.stun_servers, superseded, self.events.state, self._dropped())
 
     def _dropped(self) -> dict[str, int]:
-        """What the driver itself left out or put off, by reason."""
+        """Return what the driver itself left out or put off, by reason."""
         return {
             "report_slowed": self.report_shares.slowed,
             "log_line_left_out": self._lines.left_out,
@@ -513,7 +513,7 @@ class ControlLoop:
         }
 
     def close_streams(self) -> None:
-        """Tell every stream that the control plane stops."""
+        """Tell every stream that the control plane is stopping."""
         self._closing = True
         for mailbox in self._mailboxes.values():
             mailbox.close(CloseReason.STOPPING)

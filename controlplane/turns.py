@@ -1,7 +1,7 @@
-"""Work of the event loop that takes long, cut into turns: between two of them the loop does whatever else is due.
+"""Cuts long work of the event loop into turns, between which the loop does whatever else is due.
 
-All such work of a program takes its turns from one `Turns`, so that however much of it is under way, one turn of it at
-most stands between two looks of the loop at its streams.
+All such work of a program takes its turns from one `Turns`. However much of it is under way, the loop never runs more
+than one turn before it serves its streams again.
 """
 
 from __future__ import annotations
@@ -17,20 +17,20 @@ T = TypeVar("T")
 R = TypeVar("R")
 
 TURN_S = 0.002
-"""Processor time of a turn. What is done with its results, as encoding them, comes on top."""
+"""Processor time of a turn. Work on its results, such as encoding them, comes on top."""
 
 
 class Turns:
-    """For one event loop; who waits longest is next."""
+    """The turns of one event loop, granted in order of arrival."""
 
     def __init__(self) -> None:
         self._turn = asyncio.Lock()
 
     async def each(self, items: Iterable[T], work: Callable[[T], R], times: float = 1.0) -> AsyncIterator[list[R]]:
-        """Yield what `work` makes of each item, as lists of what one turn made.
+        """Apply `work` to each item and yield the results, one list for each turn.
 
-        `times`: a turn of it is so many times as long as the usual one. The items are taken as the turns come: an
-        iterable may follow what happens meanwhile.
+        `times` is the length of a turn in multiples of `TURN_S`. Items are drawn turn by turn, so the iterable may
+        reflect what happens meanwhile.
         """
         rest = iter(items)
         done = False
