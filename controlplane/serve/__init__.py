@@ -1,1 +1,1 @@
-"""What sidecars and operators reach: the gate, the gRPC services, what is written to streams."""
+"""The parts that sidecars and operators reach: the gate, the gRPC services, the encoding of streams."""

@@ -1,4 +1,4 @@
-"""Which role may call what on the gRPC port; everything else is refused before any service sees it."""
+"""Decides which role may call what on the gRPC port, and refuses everything else before any service sees it."""
 
 from __future__ import annotations
 
@@ -25,11 +25,11 @@ _ALLOWED = {
     "grpc.reflection.v1alpha.ServerReflection": frozenset({IdentityRole.OPERATOR}),
     "grpc.health.v1.Health": _ANYBODY,
 }
-"""Service -> roles; a service that is not here is nobody's."""
+"""Service -> roles; a service that is missing here may be called by nobody."""
 
 
 class AccessGuard(grpc.aio.ServerInterceptor):
-    """Asks `caller` who is behind the peer of each call; `on_refused` is told the reason of each refusal."""
+    """Asks `caller` who is behind the peer of each call; passes the reason of each refusal to `on_refused`."""
 
     def __init__(self, caller: Callable[[str], Caller | None], on_refused: Callable[[str], None]) -> None:
         self._caller = caller
@@ -40,7 +40,7 @@ class AccessGuard(grpc.aio.ServerInterceptor):
         continuation: Callable[[grpc.HandlerCallDetails], Awaitable[_Handler | None]],
         handler_call_details: grpc.HandlerCallDetails,
     ) -> _Handler | None:
-        """Wrap the method so that it runs for the roles that may call it only."""
+        """Wrap the method so that it runs only for the roles that may call it."""
         handler = await continuation(handler_call_details)
         if handler is None:
             return handler

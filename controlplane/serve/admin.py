@@ -1,7 +1,7 @@
-"""The gRPC side of `Admin`: what the operator asks.
+"""Serves `Admin` over gRPC: answers the operator's questions.
 
-Answers about the fleet are made, encoded and sent in turns of the loop (`Turns`). Messages in one piece are put
-together from the bytes of their parts: what is repeated in protobuf may be cut anywhere between two elements.
+Answers about the fleet are computed, encoded and sent in turns of the loop (`Turns`). An undivided message is the
+concatenation of its encoded parts: a repeated field of protobuf may be cut between any two elements.
 """
 
 from __future__ import annotations
@@ -34,17 +34,18 @@ if TYPE_CHECKING:
 SERVICE_NAME = admin_pb2.DESCRIPTOR.services_by_name["Admin"].full_name
 
 STATUS_TURNS = 3.0
-"""As long is a turn of it as so many usual ones: somebody waits for all of it, and between two turns the loop and the
-solver have theirs."""
+"""Length of a status turn in usual turns: somebody waits for the whole answer, and the loop and the solver still run
+between two turns."""
 
 DEPARTED_TOLD = 256
-"""Sidecars that are gone in one status, those that went last; `plr events` tells of the others."""
+"""Departed sidecars in one status, the most recent ones; `plr events` shows the others."""
 
 EVENTS_TOLD = 10
-"""Events in one status, the last ones."""
+"""Events in one status, the most recent ones."""
 
 MAX_STATUS_BYTES = 16 << 20
-"""Of GetStatus: four times what 4,096 robots with 15 paths each take, and gRPC's default for what a client takes."""
+"""Longest GetStatus answer: four times what 4,096 robots with 15 paths each take, and four times gRPC's default limit
+for a client."""
 
 
 class AdminService:
@@ -68,7 +69,7 @@ class AdminService:
         server.add_generic_rpc_handlers((grpc.method_handlers_generic_handler(SERVICE_NAME, handlers),))
 
     async def get_status(self, request: admin_pb2.GetStatusRequest, context: Any) -> bytes:
-        """Every registered sidecar and how far it follows, who is gone, and what happened last, in one message."""
+        """Return all registered sidecars and how far each follows, the departed and the last events, in one message."""
         answer = bytearray()
         async for part in self._status(StatusQuery()):
             answer += part
@@ -78,7 +79,7 @@ class AdminService:
         return bytes(answer)
 
     async def stream_status(self, request: admin_pb2.StreamStatusRequest, context: Any) -> AsyncIterator[bytes]:
-        """The same in parts."""
+        """Yield the same in parts."""
         try:
             query = status_query_from_proto(request)
         except DecodeError as error:
@@ -102,7 +103,7 @@ class AdminService:
             yield b"".join(found)
 
     async def explain(self, request: admin_pb2.ExplainRequest, context: Any) -> admin_pb2.ExplainResponse:
-        """Why a robot's requests for a service go where they go."""
+        """Explain why a robot's requests for a service go where they go."""
         try:
             robot, service = explain_request_from_proto(request)
             return explanation_to_proto(self._loop.explain(robot, service))
@@ -112,7 +113,7 @@ class AdminService:
             await _abort(context, grpc.StatusCode.NOT_FOUND, str(error))
 
     async def list_events(self, request: admin_pb2.ListEventsRequest, context: Any) -> bytes:
-        """What happened in the fleet."""
+        """Return what happened in the fleet."""
         try:
             query = event_query_from_proto(request)
         except DecodeError as error:

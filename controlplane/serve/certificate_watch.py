@@ -1,4 +1,4 @@
-"""Keeps the control plane's certificate files, and whoever they speak of, up to date while it runs."""
+"""Keeps the control plane's certificate files up to date while it runs, and re-checks the members they concern."""
 
 from __future__ import annotations
 
@@ -37,24 +37,25 @@ def load_own_files(directory: Path) -> TlsFiles:
 
 
 class CertificateKeeper:
-    """Looks for new files and for the end of certificates, and has the gate and the loop judge members anew.
+    """Watches for new files and expired certificates, and has the gate and the loop check members again.
 
-    To check a certificate takes some tenth of a millisecond, and a change concerns everybody: members are judged in
-    turns of the loop, those first whom a list names. With each its stream first: who is revoked shall hear so from
-    gRPC before its connections are cut. Who comes meanwhile is judged by the new files already.
+    Checking a certificate takes a few tenths of a millisecond, and a change concerns everybody. Members are therefore
+    checked in turns of the loop, those named in a revocation list first. The stream of a member comes before its
+    connections, so that a revoked one learns the reason from gRPC before it is cut off. New connections are checked by
+    the new files at once.
     """
 
     def __init__(self, files: TlsFiles, gate: TlsGate, loop: ControlLoop, metrics: Metrics, clock: ClockFloor) -> None:
-        """`clock` is the gate's too."""
+        """Watch `files`; `clock` is shared with the gate."""
         self._clock = clock
         self._watch = TlsWatch(files)
         self._gate = gate
         self._loop = loop
         self._metrics = metrics
         self._unfit = False
-        """The folder's files are whole, but none that TLS takes."""
+        """Whether the folder's files are complete, but TLS refuses them."""
         self._unjudged: dict[NodeName, None] = {}
-        """In the order in which they will be."""
+        """Members still to be checked, in order."""
         self._something_to_judge = asyncio.Event()
         metrics.own_certificate(files.identity, files.trust.lists())
         self._relay_revocations(files)
@@ -89,12 +90,12 @@ class CertificateKeeper:
             log.info("took new certificate files from %s", files.directory)
         everybody = [*self._loop.serials(), *self._gate.serials()]
         named = dict.fromkeys(name for name, serial in everybody if files.trust.revokes(serial))
-        # Those whom the change before still concerns come before those who are judged already: however often the files
-        # change, everybody's turn comes.
+        # Members left over from the change before come before those checked already: however often the files change,
+        # everybody's turn comes.
         self._judge(named | self._unjudged | dict.fromkeys(name for name, _ in everybody))
 
     def _judge(self, names: dict[NodeName, None]) -> None:
-        """Judge these, and then whoever else is still to be judged."""
+        """Check these members, and then all others still to be checked."""
         if names:
             self._unjudged = names | self._unjudged
             self._something_to_judge.set()

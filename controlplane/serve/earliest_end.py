@@ -1,4 +1,4 @@
-"""When the first of many certificates ends: known without a look at all of them, until one does."""
+"""Tracks when the first of many certificates expires, without scanning all of them until one does."""
 
 from __future__ import annotations
 
@@ -12,17 +12,17 @@ if TYPE_CHECKING:
 
 
 class EarliestEnd:
-    """Times are seconds since 1970."""
+    """The earliest expiry among the certificates in use; times are seconds since 1970."""
 
     def __init__(self) -> None:
         self._at = math.inf
 
     def note(self, end: float) -> None:
-        """One more is in use."""
+        """Note one more certificate in use."""
         self._at = min(self._at, end)
 
     def ended(self, in_use: Iterable[tuple[NodeName, float]], now: float) -> list[NodeName]:
-        """Whose have ended by `now`; `in_use` is looked at only if some has, or one that was the first is gone."""
+        """Return whose have expired by `now`; scan `in_use` only if one has, or if the former earliest is gone."""
         if now <= self._at:
             return []
         found: list[NodeName] = []

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 
 class PipeEnd(asyncio.Protocol):
-    """One of the two connections; what it receives before `join` waits, and it is not read further."""
+    """One of the two connections; what it receives before `join` waits, and reading pauses."""
 
     def __init__(self, on_lost: Callable[[], None] | None = None) -> None:
         self._transport: asyncio.Transport | None = None
@@ -24,17 +24,17 @@ class PipeEnd(asyncio.Protocol):
         self._on_lost = on_lost
         self.lost = False
         self.received_at = -math.inf
-        """When it passed something on last, in monotonic seconds."""
+        """When it last passed something on, in monotonic seconds."""
 
     @property
     def transport(self) -> asyncio.Transport:
-        """The connection; there once the event loop has made it."""
+        """The connection; available once the event loop has made it."""
         assert self._transport is not None
         return self._transport
 
     @staticmethod
     def join(one: PipeEnd, other: PipeEnd) -> None:
-        """From now on what one receives is written to the other; both have to be connected."""
+        """Write what one end receives to the other from now on; both must be connected."""
         one._other, other._other = other, one
         for source, sink in ((one, other), (other, one)):
             if source._early:
@@ -48,8 +48,8 @@ class PipeEnd(asyncio.Protocol):
         other.transport.resume_reading()
 
     def close(self) -> None:
-        """End the connection once what was written to it is out."""
-        # Closed once it is closing, asyncio's TLS transport forgets its connection: `abort` does nothing, or raises.
+        """End the connection once everything written to it is sent."""
+        # If closed while closing, asyncio's TLS transport forgets its connection: `abort` then does nothing, or raises.
         if self._transport is not None and not self._transport.is_closing():
             self._transport.close()
 
@@ -59,12 +59,12 @@ class PipeEnd(asyncio.Protocol):
             self._transport.abort()
 
     def unread(self) -> bool:
-        """Whether something has arrived that is not even read from the socket yet."""
+        """Return whether data has arrived that is not yet read from the socket."""
         if self.lost or self._transport is None:
             return False
         sock = self._transport.get_extra_info("socket")
         if sock is None or sock.fileno() < 0:
-            # TLS has lost its connection, and tells us in the next turn of the loop.
+            # TLS has lost its connection and reports it in the next turn of the loop.
             return False
         waiting = fcntl.ioctl(sock.fileno(), termios.FIONREAD, bytes(4))
         return bool(struct.unpack("i", waiting)[0])
@@ -72,13 +72,13 @@ class PipeEnd(asyncio.Protocol):
     # ── asyncio.Protocol ──
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        """The connection is there; reading waits for `join`."""
+        """Keep the connection; pause reading until `join`."""
         assert isinstance(transport, asyncio.Transport)
         self._transport = transport
         transport.pause_reading()
 
     def data_received(self, data: bytes) -> None:
-        """Pass it on."""
+        """Pass the data on."""
         self.received_at = time.monotonic()
         if self.lost:
             return
@@ -88,21 +88,21 @@ class PipeEnd(asyncio.Protocol):
             self._other.transport.write(data)
 
     def eof_received(self) -> bool:
-        """gRPC has no use for half a connection: both ends close."""
+        """Close both ends: gRPC has no use for a half-closed connection."""
         return False
 
     def pause_writing(self) -> None:
-        """This end is slow: the other one is not read meanwhile."""
+        """Stop reading the other end while this one is slow."""
         if self._other is not None and not self._other.lost:
             self._other.transport.pause_reading()
 
     def resume_writing(self) -> None:
-        """This end has caught up."""
+        """Read the other end again: this one has caught up."""
         if self._other is not None and not self._other.lost:
             self._other.transport.resume_reading()
 
     def connection_lost(self, exc: Exception | None) -> None:
-        """The other end has nobody to talk to any more."""
+        """Close the other end, which has no peer any more."""
         self.lost = True
         if self._on_lost is not None:
             self._on_lost()
@@ -112,5 +112,5 @@ class PipeEnd(asyncio.Protocol):
             return
         other.close()
         if other.lost:
-            # The garbage collector does not look at what has been there for long (`protos.program.interpreter`).
+            # Break the cycle: the collector skips long-lived objects (`protos.program.interpreter`).
             self._other = other._other = None

@@ -1,4 +1,4 @@
-"""Connections that are not let in yet: of more than there is room for the oldest end."""
+"""Keeps the connections that are not admitted yet: when there is no room, the oldest ends."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ if TYPE_CHECKING:
 
 
 class HalfOpen:
-    """In one state of being opened; each is a task that lets it in or ends it.
+    """The connections in one state of being opened; each is a task that admits it or ends it.
 
-    Who opens many from one address pushes out his own: an address may be a NAT, with a fleet and its operator behind
-    it, so a new one is never refused for the others that came from there. All calls take as long whatever their number.
+    A client that opens many from one address pushes out its own. The address may be a NAT with a fleet and its operator
+    behind it, so a new connection is never refused because of the others from there. All calls take constant time.
     """
 
     __slots__ = ("_most", "_most_of_source", "_sources", "_tasks")
@@ -22,19 +22,19 @@ class HalfOpen:
         self._most = most
         self._most_of_source = most_of_source
         self._tasks: OrderedDict[asyncio.Task[None], str] = OrderedDict()
-        """All, with their sources, oldest first."""
+        """All connections with their sources, oldest first."""
         self._sources: dict[str, OrderedDict[asyncio.Task[None], None]] = {}
 
     def __len__(self) -> int:
         return len(self._tasks)
 
     def tasks(self) -> list[asyncio.Task[None]]:
-        """All of them."""
+        """Return all connections."""
         return list(self._tasks)
 
     def add(self, task: asyncio.Task[None], source: str) -> bool:
-        """One more from this source; returns whether there was no room: then the oldest of the source, or of all, is
-        cancelled."""
+        """Add a connection from this source; return whether that cancelled the oldest, of the source or of all, for
+        want of room."""
         before = len(self._tasks)
         of_source = self._sources.get(source)
         if of_source is not None and len(of_source) >= self._most_of_source:
@@ -46,7 +46,7 @@ class HalfOpen:
         return len(self._tasks) == before
 
     def remove(self, task: asyncio.Task[None]) -> None:
-        """It is let in or over, or in another state; or it was pushed out before."""
+        """Remove a connection that is admitted, over or in another state; does nothing if it was pushed out before."""
         source = self._tasks.pop(task, None)
         if source is None:
             return

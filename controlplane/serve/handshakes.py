@@ -1,4 +1,4 @@
-"""What a TLS handshake needs, and why one failed: a word for the metrics and a text for the log."""
+"""Prepares TLS handshakes, and says why one failed: a word for the metrics and a text for the log."""
 
 from __future__ import annotations
 
@@ -31,12 +31,12 @@ _SSL_REASONS = {
 
 
 NO_CHECK_TIME = ssl.VerifyFlags(0x20_0000)
-"""X509_V_FLAG_NO_CHECK_TIME of OpenSSL, which the module does not name: the gate itself looks at the terms, by the
-clock's floor, and can say whose certificate has ended."""
+"""X509_V_FLAG_NO_CHECK_TIME of OpenSSL, which the `ssl` module does not name. The gate itself checks the validity
+periods, by the clock's floor, and can say whose certificate has expired."""
 
 
 def server_context(files: TlsFiles) -> ssl.SSLContext:
-    """Return what accepts TLS 1.3 from holders of a certificate of these CAs, and nothing else.
+    """Return a context that accepts TLS 1.3 from holders of a certificate of these CAs, and nothing else.
 
     Raises:
         ssl.SSLError: OpenSSL refuses the files.
@@ -45,7 +45,7 @@ def server_context(files: TlsFiles) -> ssl.SSLContext:
     context.minimum_version = ssl.TLSVersion.TLSv1_3
     context.verify_mode = ssl.CERT_REQUIRED
     context.verify_flags |= NO_CHECK_TIME
-    # Every connection shows its certificate anew: a resumed session would be as old as its first handshake.
+    # Every connection presents its certificate: the check of a resumed session would be as old as its first handshake.
     context.options |= ssl.OP_NO_TICKET
     context.num_tickets = 0
     context.set_alpn_protocols(["h2"])
@@ -55,7 +55,7 @@ def server_context(files: TlsFiles) -> ssl.SSLContext:
 
 
 def _load_key(context: ssl.SSLContext, files: TlsFiles) -> None:
-    """The module reads keys from files only; the one in memory is the one that was checked."""
+    """Load the key in memory, which was checked, although the `ssl` module reads keys from files only."""
     handle = os.memfd_create("plr-key")
     try:
         os.write(handle, files.certificate_pem + b"\n" + files.key_pem)
@@ -65,7 +65,7 @@ def _load_key(context: ssl.SSLContext, files: TlsFiles) -> None:
 
 
 def why_failed(error: Exception) -> tuple[str, str]:
-    """Return the reason and a text for a handshake that ended with this error."""
+    """Return the reason and a text for a handshake that failed with this error."""
     if isinstance(error, ssl.SSLCertVerificationError):
         return UNTRUSTED, f"the client's certificate: {error.verify_message}"
     if isinstance(error, ssl.SSLError):

@@ -1,6 +1,6 @@
-"""What waits to be written to one stream: bounded, as a newer resource takes the place of an unsent older one.
+"""Holds what waits to be written to one stream: bounded, since a newer resource replaces an unsent older one.
 
-Changes of the peers are put together with what they are upon if that is unsent, too.
+A change of the peers is merged into an unsent set or change that it builds on.
 """
 
 from __future__ import annotations
@@ -18,21 +18,21 @@ if TYPE_CHECKING:
     from protos.model.stream import ControlMessage
 
 _ORDER = (Welcome, PeerSet, MappingSet)
-"""A mapping goes after the peers it names."""
+"""Order of writing: a mapping follows the peers that it names."""
 
 
 class Mailbox:
-    """At most one message of each type, and at last the reason to close; for one event loop."""
+    """At most one message of each type, and finally the reason to close; for one event loop."""
 
     def __init__(self) -> None:
         self._waiting: dict[type[ControlMessage], ControlMessage] = {}
         self._changed = asyncio.Event()
         self._close_reason: CloseReason | None = None
         self.superseded = 0
-        """Messages that a newer one replaced before they were written: the stream is slower than the changes."""
+        """Messages replaced by a newer one before they were written: the stream is slower than the changes."""
 
     def put(self, message: ControlMessage) -> None:
-        """Send this, instead of an unsent older message of its type."""
+        """Queue this message, in place of an unsent older one of its type."""
         unsent = self._waiting.get(type(message))
         self.superseded += unsent is not None
         if isinstance(message, PeerSet) and isinstance(unsent, PeerSet):
@@ -41,7 +41,7 @@ class Mailbox:
         self._changed.set()
 
     def close(self, reason: CloseReason) -> None:
-        """End the stream; what is unsent does not matter any more."""
+        """End the stream; unsent messages no longer matter."""
         self._close_reason = reason
         self._changed.set()
 

@@ -1,4 +1,4 @@
-"""The whole control plane in one event loop: gRPC, STUN, metrics, and an orderly end."""
+"""Runs the whole control plane in one event loop: gRPC, STUN, metrics, and an orderly end."""
 
 from __future__ import annotations
 
@@ -41,45 +41,45 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 STOP_GRACE_S = 1.0
-"""For streams to take their last message; what then still hangs is cut."""
+"""Time for streams to take their last message; those that still hang are cut."""
 
 STATUS_EVERY_S = 2.0
-"""How often `systemctl status` may learn how it is."""
+"""Interval between updates of the state that `systemctl status` shows."""
 
 GRPC_OPTIONS: tuple[tuple[str, int], ...] = (
-    # Sidecars behind cellular NATs ping to keep their binding, also with no call open, but not faster than this.
+    # Sidecars behind cellular NATs ping to keep their binding, even with no call open, but not faster than this.
     ("grpc.keepalive_permit_without_calls", 1),
     ("grpc.http2.min_ping_interval_without_data_ms", 5_000),
-    # Ours find connections that died silently; the lease has removed their sidecar by then.
+    # Our pings find connections that died silently; the lease has removed their sidecar by then.
     ("grpc.keepalive_time_ms", 20_000),
     ("grpc.keepalive_timeout_ms", 10_000),
     ("grpc.max_receive_message_length", MAX_MESSAGE_BYTES),
     ("grpc.max_concurrent_streams", MAX_STREAMS_PER_CONNECTION),
-    # A connection without a call is not worth its place for longer than somebody reads the answer to the one before.
+    # A connection without a call keeps its place for as long as somebody reads the answer to the previous call.
     ("grpc.max_connection_idle_ms", 60_000),
-    # A second control plane on the same port is a mistake to be told, not to be shared the streams with.
+    # A second control plane on the same port is an error to report, not one to share the streams with.
     ("grpc.so_reuseport", 0),
 )
 
 SERVERS = 8
-"""gRPC servers behind the gate, which gives each connection to the next one. One server takes one new call in two turns
-of the event loop: few a second when a fleet comes back and turns are long. There is no option for it."""
+"""gRPC servers behind the gate, which hands connections to them in rotation. One server takes one new call every two
+turns of the event loop: few a second when a fleet comes back and turns are long. gRPC has no option for it."""
 
 MAX_CALLS = 2 * MAX_SIDECARS
-"""Calls served at once: a stream for each sidecar, and room for those that replace one and for the operator."""
+"""Concurrent calls: a stream for each sidecar, with room for replacement streams and the operator."""
 
 
 _SERVICES = ("", service.SERVICE_NAME, admin.SERVICE_NAME)
-"""What health is told of; the first is the server as a whole."""
+"""Names that the health service answers for; the first is the server as a whole."""
 
 
 class StartError(Exception):
-    """An address cannot be had; the text names the key."""
+    """An address is not available; the text names the configuration key."""
 
 
 @dataclass(frozen=True, slots=True)
 class Addresses:
-    """Where the control plane listens, with the ports really taken."""
+    """The addresses that the control plane listens on, with the ports actually taken."""
 
     grpc: str
     stun: tuple[str, ...]
@@ -97,16 +97,16 @@ async def serve(
 ) -> None:
     """Serve until `stop`; calls `ready` when everything listens, `stopping` when the end begins.
 
-    `tell` is given a few words on how it is, now and then.
+    `tell` receives the state in a few words, now and then.
 
-    `files` is None in insecure mode. Raises StartError if an address cannot be had.
+    `files` is None in insecure mode. Raises StartError if an address is not available.
     """
     metrics = Metrics()
     events = EventLog(config.state_dir)
     async with contextlib.AsyncExitStack() as cleanup:
         cleanup.callback(events.close)
         loop = ControlLoop(config, metrics, events)
-        # Nobody but this user gets at the socket behind the gate.
+        # Nobody but this user can reach the socket behind the gate.
         folder = cleanup.enter_context(tempfile.TemporaryDirectory(prefix="plr-controlplane-"))
         upstreams = [f"{folder}/grpc-{number}" for number in range(SERVERS)]
         clock = ClockFloor(time.time, alert=log.error)
@@ -163,7 +163,7 @@ async def _tell_status(loop: ControlLoop, tell: Callable[[str], None]) -> None:
 def _make_servers(
     config: ControlPlaneConfig, loop: ControlLoop, metrics: Metrics, gate: TlsGate | None
 ) -> tuple[list[grpc.aio.Server], health.aio.HealthServicer]:
-    """The servers, which serve the same; without a gate one, since only the gate can divide connections."""
+    """Return identical servers; without a gate only one, since only the gate can divide connections."""
     guards = () if gate is None else (AccessGuard(gate.caller, metrics.refused_connection),)
     control_plane = service.ControlPlaneService(loop, config.report_interval_ms / 1000, gate)
     admin_service = admin.AdminService(loop)
@@ -195,7 +195,7 @@ async def _start_stun(
     for listen in config.stun_listen:
         host, port = split_host_port(listen)
         try:
-            # "" is all addresses of both families, and IPv6 may be missing.
+            # "" means all addresses of both families, of which IPv6 may be missing.
             stun = await start_stun_server("" if host == "::" else host, port)
         except OSError as error:
             raise StartError(f"stun_listen: cannot listen on {listen}: {error.strerror or error}") from error
@@ -215,7 +215,7 @@ def _start_metrics(config: ControlPlaneConfig, metrics: Metrics) -> str | None:
 def _add_port(config: ControlPlaneConfig, server: grpc.aio.Server) -> str:
     host, wanted = split_host_port(config.listen)
     try:
-        # gRPC itself writes a raw line of its own about an address that it cannot have, and does not tell us why.
+        # gRPC writes a raw line of its own about an address that is not available, and does not tell us why.
         family = socket.AF_INET6 if ":" in host else socket.AF_INET
         socket.create_server((host, wanted), family=family).close()
         port = server.add_insecure_port(config.listen)
@@ -225,7 +225,7 @@ def _add_port(config: ControlPlaneConfig, server: grpc.aio.Server) -> str:
 
 
 def _reason(error: OSError | RuntimeError) -> str:
-    # The text of asyncio and of sockets made ready to listen repeats the address.
+    # The messages of asyncio and of `create_server` repeat the address.
     return os.strerror(error.errno) if isinstance(error, OSError) and error.errno else str(error)
 
 

@@ -1,4 +1,4 @@
-"""The gRPC side of `ControlPlane.Connect`: moves messages between one stream and the loop."""
+"""Serves `ControlPlane.Connect` over gRPC: moves messages between one stream and the loop."""
 
 from __future__ import annotations
 
@@ -46,16 +46,16 @@ if TYPE_CHECKING:
 SERVICE_NAME = control_pb2.DESCRIPTOR.services_by_name["ControlPlane"].full_name
 
 REGISTER_TIMEOUT_S = 10.0
-"""A stream that says nothing for this long after it was opened is closed: slower than any sidecar's start."""
+"""A stream that stays silent for this long after it was opened is closed: longer than any sidecar's start takes."""
 
 REGISTERED_AT_ONCE = 4
-"""In one turn of the loop."""
+"""Registrations in one turn of the loop."""
 
 LOOK_AGAIN_S = 1.0
-"""How long a member that sent too much is left alone at most, before its share is looked at again."""
+"""Longest pause for a member that sent too much, before its share is checked again."""
 
 SHORT_BYTES = 4096
-"""A message up to this long is taken at once."""
+"""A message up to this length is parsed at once."""
 
 _REFUSAL_CODES = {
     Refusal.OLDER_INCARNATION: grpc.StatusCode.ABORTED,
@@ -92,8 +92,8 @@ class _StreamEndError(Exception):
 class ControlPlaneService:
     """Serves `Connect`. Bytes are parsed here, not by gRPC, so that bad ones get a clear status.
 
-    `report_interval_s` is what the sidecars are told.
-    `gate` knows who is behind a peer of gRPC's; None in insecure mode, where a sidecar is who it says.
+    `report_interval_s` is sent to the sidecars.
+    `gate` knows who is behind a peer of gRPC; None in insecure mode, where a sidecar is believed to be who it says.
     """
 
     def __init__(self, loop: ControlLoop, report_interval_s: float, gate: TlsGate | None) -> None:
@@ -154,7 +154,7 @@ class ControlPlaneService:
         raise _StreamEndError(*end)
 
     async def _register(self, context: Context, caller: Caller | None) -> tuple[NodeName, StreamId, Mailbox, bool]:
-        """Returns whose stream it is, which, what to write to it, and whether it takes changes."""
+        """Return the stream's member, its id, its mailbox, and whether it takes incremental changes."""
         try:
             async with asyncio.timeout(REGISTER_TIMEOUT_S):
                 found = _first_message(await self._receive(context))
@@ -164,7 +164,7 @@ class ControlPlaneService:
             raise _StreamEndError(*found)
         registration = found
         async with self._turn:
-            # Few in each turn of the loop: the messages of those who are registered already come in between.
+            # Register few in each turn of the loop: messages of registered members come in between.
             await asyncio.sleep(0)
             result = self._loop.register(registration, caller)
         if isinstance(result, Refusal):
@@ -175,7 +175,7 @@ class ControlPlaneService:
         if self._gate is None:
             return None
         caller = self._gate.caller(context.peer())
-        # The guard saw one a moment ago; a connection that has ended since must not count as insecure mode.
+        # The guard saw a caller a moment ago; a connection that has ended since must not count as insecure mode.
         if caller is None or caller.refusal is not None:
             raise _StreamEndError(grpc.StatusCode.UNAUTHENTICATED, "the connection has ended")
         return caller
@@ -212,7 +212,7 @@ class ControlPlaneService:
             except DecodeError as error:
                 malformed = str(error)
             if malformed is not None:
-                # Out here: an error holds all that was parsed where it was raised, and so would this one.
+                # Raised out here: an error keeps alive all that was parsed where it was raised.
                 raise _StreamEndError(grpc.StatusCode.INVALID_ARGUMENT, malformed)
             entries = sum(report_entries(part) for part in parts if isinstance(part, Report))
             if entries and shares.take(name, entries, time.monotonic()):
@@ -220,7 +220,7 @@ class ControlPlaneService:
                     await asyncio.sleep(min(wait_s, LOOK_AGAIN_S))
 
     async def _parse(self, data: bytes) -> list[SidecarMessage]:
-        """A message; a long report in parts, in turns with whatever else is due."""
+        """Parse a message; a long report in parts, in turns with whatever else is due."""
         if len(data) <= SHORT_BYTES:
             return [parse_sidecar_message(data)]
         parts: list[SidecarMessage] = []
@@ -237,17 +237,17 @@ class ControlPlaneService:
                 try:
                     await context.write(data)
                 except grpc.aio.InternalError as error:
-                    # The connection broke under the message: so gRPC says it to whoever writes.
+                    # The connection broke during the message: this is how gRPC reports it to a writer.
                     raise _StreamEndError(None, "the connection broke") from error
 
 
 _End = tuple[grpc.StatusCode | None, str]
-"""The status of a stream, and details. Passed on, not raised where it is found: an error holds all that was parsed
-there for as long as it lives."""
+"""The final status of a stream, and details. Returned, not raised where it is found: an error keeps alive all that was
+parsed there."""
 
 
 def _only_end(group: BaseExceptionGroup) -> _End | None:
-    """Why a stream ends, if nothing else is in the group."""
+    """Return why a stream ends, if nothing else is in the group."""
     ends, others = group.split(_StreamEndError)
     if others is not None or ends is None:
         return None
@@ -258,14 +258,14 @@ def _only_end(group: BaseExceptionGroup) -> _End | None:
 
 
 def _first_message(data: bytes) -> Registration | _End:
-    """What a stream begins with, or why it may not."""
+    """Return the registration that a stream begins with, or why it ends."""
     if len(data) > MAX_FIRST_BYTES:
         return _NOT_A_REGISTRATION
     try:
         message = read_sidecar_message(data)
         kind = message.WhichOneof("kind")
         if kind == "register":
-            # Before all else: what another version says may have another meaning.
+            # Checked first: a message of another version may have another meaning.
             oldest = message.register.protocol_version
             problem = refusal(Spoken(oldest, message.register.newest_protocol_version or oldest))
             if problem is not None:

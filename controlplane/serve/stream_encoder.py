@@ -1,7 +1,7 @@
-"""What is written to the control streams, as bytes: each peer is encoded once for all sidecars that are told of it.
+"""Encodes the messages of the control streams: each peer once for all sidecars that receive it.
 
-Protobuf lets the fields of a message stand in any order, so a peer is its encoding without the token, which all are
-told alike, followed by the token, which each is told another of.
+Protobuf allows the fields of a message in any order. A peer is therefore its encoding without the token, the same for
+all, followed by the token, which differs for each sidecar.
 """
 
 from __future__ import annotations
@@ -21,13 +21,13 @@ if TYPE_CHECKING:
     from protos.model.stream import ControlMessage
 
 PART_BYTES = 256 << 10
-"""Of a set's peers in one message: some 350, a few milliseconds of the loop, and far below gRPC's 4 MiB."""
+"""Bytes of a set's peers in one message: some 350 peers, a few milliseconds of the loop, far below gRPC's 4 MiB."""
 
 MAX_KEPT = 16_384
-"""Encodings kept: a fleet's peers, before and after each has changed. Beyond that all are forgotten."""
+"""Encodings kept: a fleet's peers, before and after each has changed. Beyond that all are discarded."""
 
 MAX_KEPT_BYTES = 64 << 20
-"""The same: those of 4096 servers take some 4 MiB, one with as many offers as can be half a MiB."""
+"""The same limit in bytes: the encodings of 4096 servers take some 4 MiB, one with the most offers half a MiB."""
 
 _LENGTH_DELIMITED = 2
 
@@ -51,15 +51,15 @@ _PEER_SET = _tag(control_pb2.ControlMessage.PEERS_FIELD_NUMBER)
 
 
 class StreamEncoder:
-    """For all streams of one control plane."""
+    """Encodes for all streams of one control plane."""
 
     def __init__(self) -> None:
         self._encoded: dict[int, tuple[Peer, bytes]] = {}
-        """By the identity of the peer, which is held so that no other takes its place."""
+        """Encodings by the `id` of the peer, which is kept alive so that no other object gets that id."""
         self._kept_bytes = 0
 
     def encode(self, message: ControlMessage, *, incremental: bool) -> Iterator[bytes]:
-        """The messages that say this, each made when it is asked for; only `incremental` sidecars take several."""
+        """Yield the encoded messages, each made on demand; only `incremental` sidecars take several."""
         if isinstance(message, PeerSet):
             yield from self._peer_set(message, PART_BYTES if incremental else None)
         else:

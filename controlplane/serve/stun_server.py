@@ -1,12 +1,12 @@
-"""The STUN server: UDP sockets, a thread of its own that moves datagrams between them and the responder.
+"""Serves STUN: a thread of its own moves datagrams between UDP sockets and the responder.
 
-Of its own, as a robot that comes up asks before it registers, and needs the answer within its retransmissions: in the
-event loop it would wait for whatever a fleet of others registers, and a flood from anybody would hold up the streams of
-all. The two still share the interpreter. It gives the thread half a millisecond after it asks, and the thread takes a
+A starting robot asks before it registers, and needs the answer within its retransmissions. In the event loop it would
+wait behind the registrations of a whole fleet, and a flood from anybody would hold up everybody's streams. The two
+threads still share the interpreter. It serves this thread half a millisecond after it asks, and the thread takes a
 quarter of a processor at most: it rests three times as long as it has worked.
 
-Plain non-blocking sockets for two reasons: a wake-up drains a batch of requests, and a host with several addresses
-answers from the address that was asked (IP_PKTINFO), without which NATs and clients refuse the answer.
+The sockets are plain and non-blocking for two reasons. A wake-up drains a batch of requests, and a host with several
+addresses answers from the address that was asked (IP_PKTINFO); NATs and clients refuse any other answer.
 """
 
 from __future__ import annotations
@@ -35,19 +35,19 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 BATCH_DATAGRAMS = 64
-"""Datagrams taken per wake-up and socket: one or two milliseconds of work, and as long a rest as others can wait."""
+"""Datagrams taken per wake-up and socket: 1 to 2 ms of work, then a rest no longer than others can wait."""
 
 SHARE = 0.25
-"""Of one processor, at most: some thousand answers a second, ten times what the largest fleet asks at its start."""
+"""Maximum share of one processor: some thousand answers a second, ten times what the largest fleet asks at start."""
 
 RECEIVE_BUFFER_BYTES = 1 << 20
-"""Wanted kernel buffer: a fleet that returns from an outage asks all at once."""
+"""Requested kernel buffer: a fleet that returns from an outage asks all at once."""
 
 SAME_PORT_ATTEMPTS = 16
-"""Tries to find one free port for all addresses when port 0 is asked for."""
+"""Attempts to find one free port for all addresses when port 0 is requested."""
 
 STOP_TIMEOUT_S = 1.0
-"""A thread that is not done by then is left to the end of the program."""
+"""A thread that has not ended by then is left until the program ends."""
 
 # From linux/in.h and asm-generic/socket.h: not every Python supported here names them in the socket module.
 _IP_PKTINFO = 8
@@ -60,7 +60,7 @@ _ANCILLARY_BYTES = socket.CMSG_SPACE(_PKTINFO6.size) + socket.CMSG_SPACE(_DROPS_
 
 
 class StunServer:
-    """A running server; what it counts may be read on any thread.
+    """A running server; its counters may be read on any thread.
 
     `send_failures` counts answers that the kernel refused.
     """
@@ -71,7 +71,7 @@ class StunServer:
         self._responder = StunResponder(time.monotonic(), software=software)
         self._sockets = list(sockets)
         self._drops = dict.fromkeys(self._sockets, 0)
-        """Of each socket, as the kernel told it last."""
+        """Drops of each socket, as the kernel last reported them."""
         self.addresses: tuple[Address, ...] = tuple(sock.getsockname()[:2] for sock in self._sockets)
         self._failed = False
         self._stopping = False
@@ -81,12 +81,12 @@ class StunServer:
 
     @property
     def outcomes(self) -> Counter[StunOutcome]:
-        """Datagrams by what came of them, until now."""
+        """Return the number of datagrams so far, by outcome."""
         return Counter(self._responder.outcomes.copy())
 
     @property
     def buffer_full(self) -> int:
-        """Datagrams that the kernel dropped, as more came than are answered; known when a later one is read."""
+        """Datagrams that the kernel dropped because too many came; counted when a later one is read."""
         return sum(self._drops.values())
 
     def close(self) -> None:
@@ -117,7 +117,7 @@ class StunServer:
         now = time.monotonic()
         for _ in range(BATCH_DATAGRAMS):
             try:
-                # One byte more than a message may have: what is cut off must not look whole.
+                # One byte more than a message may have: a truncated one must not look complete.
                 data, ancillary, _, peer = sock.recvmsg(MAX_MESSAGE_BYTES + 1, _ANCILLARY_BYTES)
             except BlockingIOError:
                 return
@@ -128,7 +128,7 @@ class StunServer:
                 self._note_drops(sock, ancillary)
                 response = self._responder.respond(data, _address(peer), now)
             except Exception:
-                # A mistake of ours. It must cost neither the thread nor, at each datagram, a line of the log.
+                # A bug of ours. It must not end the thread or write a log line for each datagram.
                 self.receive_failures += 1
                 if not self._failed:
                     log.exception("STUN: a datagram of %s could not be answered; further ones are counted", peer)
@@ -153,7 +153,7 @@ async def start_stun_server(hosts: str | Sequence[str], port: int, *, software: 
     """Answer on every address of `hosts`, all on one port (0: a free one, see `addresses`).
 
     "" stands for all addresses of both families; only then may IPv6 be missing on the machine. Raises OSError
-    when an address cannot be had.
+    when an address is not available.
     """
     names = [hosts] if isinstance(hosts, str) else list(hosts)
     loop = asyncio.get_running_loop()
@@ -216,11 +216,11 @@ def _address(peer: Any) -> Address:
 
 
 def _reply_from(ancillary: list[tuple[int, int, bytes]]) -> list[tuple[int, int, bytes]]:
-    """Ancillary data that makes the kernel send from the address the request was sent to."""
+    """Return ancillary data that makes the kernel send from the address that the request was sent to."""
     for level, kind, value in ancillary:
         if (level, kind) == (socket.IPPROTO_IP, _IP_PKTINFO) and len(value) >= _PKTINFO4.size:
             _, destination, _ = _PKTINFO4.unpack_from(value)
-            # The interface stays open (0): the way back is the routing table's to choose.
+            # No interface is given (0): the routing table chooses the way back.
             return [(level, kind, _PKTINFO4.pack(0, destination, bytes(4)))]
         if (level, kind) == (socket.IPPROTO_IPV6, socket.IPV6_PKTINFO) and len(value) >= _PKTINFO6.size:
             destination, index = _PKTINFO6.unpack_from(value)

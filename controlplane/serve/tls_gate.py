@@ -1,11 +1,11 @@
-"""The only way to the gRPC server from outside: mutual TLS 1.3 in front of a Unix socket of our own.
+"""Guards the only way to the gRPC server from outside: mutual TLS 1.3 in front of a Unix socket of our own.
 
     sidecar ══ TLS ══▶ gate ── unix socket in a folder of mode 0700 ──▶ gRPC server
 
-gRPC for Python tells neither why a handshake failed nor to whom a port still owes one, cannot refuse TLS 1.2, and
-gives no hold on a connection whose certificate is revoked. The gate has all of that: it counts every refusal by its
-reason, bounds what is half open, and ends connections. The gRPC server knows a connection by the name that the gate
-bound its end of the Unix socket to; the gate tells whose certificate stands behind that name.
+gRPC for Python reports neither why a handshake failed nor which handshakes are pending. It cannot refuse TLS 1.2, and
+gives no access to a connection whose certificate is revoked. The gate does all of that: it counts every refusal by its
+reason, bounds the half-open connections, and ends connections. The gRPC server knows a connection by the name that the
+gate bound its end of the Unix socket to; the gate knows whose certificate stands behind that name.
 """
 
 from __future__ import annotations
@@ -47,71 +47,71 @@ HANDSHAKE_TIMEOUT_S = 5.0
 """Two round trips over a bad cellular link take 1 to 2 s; a sidecar gives up after 5 s."""
 
 MAX_HANDSHAKES = 512
-"""TLS handshakes at once; a further one ends the oldest, so that whoever holds all of them has to hurry."""
+"""Concurrent TLS handshakes; a further one ends the oldest, so that a client that holds all of them has to hurry."""
 
 MAX_HANDSHAKES_PER_SOURCE = 256
-"""Of these, from one address (IPv6: one /64), which may be a NAT with a fleet behind it. A further one ends the oldest
+"""The same from one address (IPv6: one /64), which may be a NAT with a fleet behind it. A further one ends the oldest
 of the same address."""
 
 TURN_TIMEOUT_S = 40.0
-"""Longest wait for the turn to begin a handshake: as long as a sidecar of a large fleet waits."""
+"""Longest wait for a turn to begin a handshake: as long as a sidecar of a large fleet waits."""
 
 MAX_ON_THE_WAY = 64
-"""Connections at once between the beginning of their handshakes and their registration: half a second of work, behind
-which whatever else began would wait. Enough for a hundred a second from networks as slow as cellular ones."""
+"""Concurrent connections between the start of their handshakes and their registration: half a second of work, behind
+which any further one would wait. Enough for a hundred a second from networks as slow as cellular ones."""
 
 ON_THE_WAY_S = 1.0
-"""For how long one counts as such without a certificate: three round trips over a slow network. A stranger who takes
+"""How long one counts as such without a certificate: three round trips over a slow network. A stranger that takes
 longer keeps nobody waiting."""
 
 MAX_WAITING = 4096 + 256
-"""Connections at once that wait for their turn: the largest fleet. No TLS stands behind them; each costs a descriptor
-and a few kB."""
+"""Connections that wait for their turn: the largest fleet. They have no TLS state yet; each costs a descriptor and a
+few kB."""
 
 LOOK_EVERY_S = 0.1
-"""Between two looks for those that wait no more."""
+"""Interval between checks for clients that have stopped waiting."""
 
 ACCEPTED_AT_ONCE = 16
-"""In one turn of the loop."""
+"""Connections accepted in one turn of the loop."""
 
 MAX_SILENT = 2048
-"""Connections at once that have said nothing yet."""
+"""Concurrent connections that have sent nothing yet."""
 
 MAX_SILENT_PER_SOURCE = 1024
-"""Of these, from one address."""
+"""The same from one address."""
 
 MAX_CONNECTIONS = 2 * 4096 + 64
-"""Connections at once: one for each sidecar that may register and its replacement, and some for operators."""
+"""Concurrent connections: one for each sidecar that may register, its replacement, and some for operators."""
 
 MAX_CONNECTIONS_PER_NAME = 8
-"""A further one ends the oldest: after a change of networks that one is dead and does not know it yet."""
+"""A further one ends the oldest: after a change of networks that one is dead, but its end is not noticed yet."""
 
 LAST_WORDS_S = 0.5
-"""Between a certificate's end and that of its connections: time for gRPC to say why."""
+"""Time between the end of a certificate and that of its connections, for gRPC to say why."""
 
 ACCEPT_PAUSE_S = 0.1
-"""After the system refused to accept: it is out of descriptors, and will be for a moment."""
+"""Pause after the system refused to accept: it is out of descriptors, and will be for a moment."""
 
 READ_SIZE = 16 * 1024
-"""Bytes read at once: a TLS record, and more than any message of a small fleet."""
+"""Bytes in one read: a TLS record, and more than any message of a small fleet."""
 
 asyncio.sslproto.SSLProtocol.max_size = READ_SIZE
-"""256 kB by default. There is no other way to say it."""
+"""The default is 256 kB. There is no other way to set it."""
 
 _READ = bytearray(READ_SIZE)
-"""What all TLS connections read into. asyncio gives each a buffer of its own, though what is in it goes on to OpenSSL
-before the next connection is looked at."""
+"""Read buffer of all TLS connections. asyncio gives each its own, although the content goes on to OpenSSL before the
+next connection is read."""
 
 TOO_MANY_HANDSHAKES = "too_many_handshakes"
 TOO_MANY_CONNECTIONS = "too_many_connections"
 GAVE_UP = "gave_up"
-"""The client went while it waited for its turn."""
+"""Reason of refusal: the client left while it waited for its turn."""
 
 TELL_AGAIN_S = 60.0
-"""A member that is refused again for the same reason is logged again after so long."""
+"""Interval before a member refused again for the same reason is logged again."""
 
 MAX_TOLD = 4096
-"""Members and reasons noted for that; the one told longest ago goes."""
+"""Pairs of member and reason kept for that; the one logged longest ago is dropped."""
 
 _LOG_LINES_PER_S = 1.0
 _LOG_BURST = 20.0
@@ -122,7 +122,7 @@ _REGISTERS = frozenset({IdentityRole.ROBOT, IdentityRole.CLOUD})
 
 @dataclass(frozen=True, slots=True)
 class Caller:
-    """Whose certificate stands behind a connection; `refusal` tells why it is not believed (any more)."""
+    """The certificate's owner behind a connection; `refusal` says why it is not, or no longer, believed."""
 
     identity: Identity
     certificate: bytes = field(repr=False)
@@ -135,13 +135,13 @@ class _Connection:
     outside: PipeEnd
     inside: PipeEnd
     admitted: asyncio.Task[None]
-    """The task that let it in."""
+    """The task that admitted it."""
 
 
 class TlsGate:
-    """Accepts connections for the gRPC servers at the Unix sockets `upstreams`, in turn; for one event loop.
+    """Accepts connections for the gRPC servers at the Unix sockets `upstreams`, in rotation; for one event loop.
 
-    `on_refused` is told the reason of every connection that is refused or ended; certificates are judged by `clock`.
+    `on_refused` receives the reason of every connection that is refused or ended. Certificates are checked by `clock`.
     """
 
     def __init__(
@@ -156,7 +156,7 @@ class TlsGate:
         self._socket: socket.socket | None = None
         self._working: list[asyncio.Task[None]] = []
         self._unread: set[socket.socket] = set()
-        """Of the silent ones."""
+        """Sockets that asyncio has not taken over yet."""
         self._silent = HalfOpen(MAX_SILENT, MAX_SILENT_PER_SOURCE)
         self._handshakes = HalfOpen(MAX_HANDSHAKES, MAX_HANDSHAKES_PER_SOURCE)
         self._admission: Admission[asyncio.Task[None]] = Admission(
@@ -166,30 +166,30 @@ class TlsGate:
             member_s=HANDSHAKE_TIMEOUT_S,
         )
         self._turns: dict[asyncio.Task[None], asyncio.Future[None]] = {}
-        """Of those that wait."""
+        """The turns of the connections that wait."""
         self._waiting: dict[int, asyncio.Task[None]] = {}
-        """The same by their sockets' numbers."""
+        """The waiting tasks by their sockets' descriptors."""
         self._ends = select.poll()
-        """Tells which of them have gone."""
+        """Tells which of these clients have left."""
         self._room = asyncio.Event()
-        """Somebody waits, or is through."""
+        """Set when a connection begins to wait, or is done."""
         self._connections: OrderedDict[str, _Connection] = OrderedDict()
         self._of_name: dict[NodeName, OrderedDict[str, None]] = {}
-        """The same by the certificate's name, oldest first."""
+        """Connections by the certificate's name, oldest first."""
         self._earliest_end = EarliestEnd()
-        # Never the same name twice, in this process or another of this host: a stale one must not become somebody else.
+        # A name is never reused, in this process or another on this host: a stale one must not become somebody else's.
         self._prefix = f"plr-{secrets.token_hex(8)}"
         self._count = 0
         self._told: OrderedDict[tuple[NodeName, str], float] = OrderedDict()
-        """When each refused member was logged last, by its name and the reason."""
+        """When each refused member was last logged, by name and reason."""
         self.on_member_refused: Callable[[NodeName, str], None] = lambda name, text: None
-        """Told, as seldom as the log, whose certificate is not believed, and why."""
+        """Called, as seldom as the log, with the member whose certificate is not believed, and why."""
         self._log_lines = TokenBucket(rate=_LOG_LINES_PER_S, burst=_LOG_BURST, now=self._loop.time())
 
     # ── for the server ──
 
     def listen(self, host: str, port: int) -> int:
-        """Accept connections from now on; returns the port. Raises OSError if the address cannot be had."""
+        """Accept connections from now on and return the port; raises OSError if the address is not available."""
         family = socket.AF_INET6 if ":" in host else socket.AF_INET
         dual = family == socket.AF_INET6 and host == "::" and socket.has_dualstack_ipv6()
         self._socket = socket.create_server((host, port), family=family, backlog=MAX_WAITING, dualstack_ipv6=dual)
@@ -202,48 +202,48 @@ class TlsGate:
         return taken
 
     def caller(self, peer: str) -> Caller | None:
-        """Who is behind the connection that gRPC calls `peer`; None if there is no such connection (any more)."""
+        """Return who is behind the connection that gRPC calls `peer`; None if there is none (any more)."""
         connection = self._connections.get(peer)
         return None if connection is None else connection.caller
 
     def address(self, peer: str) -> str:
-        """Where the connection that gRPC calls `peer` comes from; that name itself if it has ended."""
+        """Return where the connection that gRPC calls `peer` comes from; that name itself if it has ended."""
         connection = self._connections.get(peer)
         known = None if connection is None else connection.outside.transport.get_extra_info("peername")
         return str(known[0]) if known else peer
 
     def is_served(self, peer: str) -> None:
-        """This one has what it came for, registered or refused: the next one may come."""
+        """Note that this connection is registered or refused: the next one may have its turn."""
         connection = self._connections.get(peer)
         if connection is not None:
             self._is_through(connection.admitted, connection.caller.identity.name)
 
     def has_unread(self, name: NodeName, since: float) -> bool:
-        """Whether a member has sent something, over any connection, that nobody can have read by `since`, in monotonic
-        seconds: bytes that wait in the kernel, or were passed on to gRPC later than that."""
+        """Return whether a member has sent something, over any connection, that nobody can have read by `since`
+        (monotonic seconds): bytes that wait in the kernel, or were passed on to gRPC later than that."""
         return any(
             connection.outside.received_at > since or connection.outside.unread()
             for connection in map(self._connections.__getitem__, self._of_name.get(name, ()))
         )
 
     def use(self, files: TlsFiles) -> None:
-        """Take these files from now on; connections that are open stay so until `review`.
+        """Use these files from now on; open connections stay open until `review`.
 
         Raises:
-            ssl.SSLError: OpenSSL refuses the files; the ones before stay in use.
+            ssl.SSLError: OpenSSL refuses the files; the previous ones stay in use.
         """
         self._context = server_context(files)
         self._trust = files.trust
 
     def serials(self) -> list[tuple[NodeName, int]]:
-        """Whose certificates stand behind the connections, with their serial numbers."""
+        """Return the members whose certificates stand behind the connections, with their serial numbers."""
         return [
             (connection.caller.identity.name, connection.caller.identity.serial)
             for connection in self._connections.values()
         ]
 
     def ended(self, now_wall: float) -> list[NodeName]:
-        """Whose certificates have ended."""
+        """Return the members whose certificates have expired."""
         in_use = (
             (connection.caller.identity.name, connection.caller.identity.not_after)
             for connection in self._connections.values()
@@ -252,7 +252,7 @@ class TlsGate:
         return self._earliest_end.ended(in_use, now_wall)
 
     def review(self, name: NodeName) -> None:
-        """End a member's connections whose certificates are not believed any more."""
+        """End a member's connections whose certificates are no longer believed."""
         for peer in list(self._of_name.get(name, ())):
             self._review(self._connections[peer])
 
@@ -291,9 +291,9 @@ class TlsGate:
                 await asyncio.sleep(0)
 
     async def _greet(self, accepted: socket.socket, address: str, source: str) -> None:
-        """Wait for the client's first bytes: who says nothing must not keep others from their handshakes.
+        """Wait for the client's first bytes: a silent one must not keep others from their handshakes.
 
-        Then for its turn, and let it in.
+        Then wait for its turn, and admit it.
         """
         accepted.setblocking(False)
         task = asyncio.current_task()
@@ -325,7 +325,7 @@ class TlsGate:
                 self._is_through(task)
 
     async def _turn(self, task: asyncio.Task[None], accepted: socket.socket, source: str) -> None:
-        """Wait for it; raises ConnectionError as soon as the client goes."""
+        """Wait for the connection's turn; raises ConnectionError as soon as the client leaves."""
         turn = self._turns[task] = self._loop.create_future()
         self._waiting[accepted.fileno()] = task
         self._ends.register(accepted, select.POLLRDHUP)
@@ -337,7 +337,7 @@ class TlsGate:
         try:
             await turn
         except BaseException:
-            # Perhaps just after its turn had come.
+            # The turn may just have been granted.
             self._admission.leave(task)
             self._is_through(task)
             raise
@@ -346,7 +346,7 @@ class TlsGate:
             del self._turns[task], self._waiting[accepted.fileno()]
 
     async def _give_turns(self) -> None:
-        """One in each turn of the loop: whatever else is due, as the messages of those who are in already, is done
+        """Grant one in each turn of the loop, so that other work, such as the messages of admitted members, runs
         between two."""
         looked_at = self._loop.time()
         while True:
@@ -368,7 +368,7 @@ class TlsGate:
                     await self._room.wait()
 
     def _drop_gone(self) -> None:
-        """Who gave up frees its place at once, and nothing is spent on it."""
+        """Free the places of clients that gave up, before anything is spent on them."""
         for number, _ in self._ends.poll(0):
             turn = self._turns[self._waiting[number]]
             if not turn.done():
@@ -380,18 +380,18 @@ class TlsGate:
             self._room.set()
 
     def _note(self, line: HalfOpen, task: asyncio.Task[None], source: str) -> None:
-        # Counted here: one that is pushed out before it came to run could not.
+        # Counted here: a task that is pushed out before it first ran could not do it.
         if line.add(task, source):
             self._on_refused(TOO_MANY_HANDSHAKES)
 
     def _close_unread(self, accepted: socket.socket, _: asyncio.Task[None]) -> None:
-        """Its task has ended before asyncio took the socket, perhaps before it came to run."""
+        """Close a socket whose task ended before asyncio took the socket, perhaps before the task first ran."""
         if accepted in self._unread:
             self._unread.discard(accepted)
             accepted.close()
 
     async def _admit(self, accepted: socket.socket, address: str, task: asyncio.Task[None]) -> bool:
-        """Returns whether the connection stands."""
+        """Do the TLS handshake and connect to gRPC; return whether the connection stands."""
         outside = PipeEnd()
         try:
             transport, _ = await self._loop.connect_accepted_socket(
@@ -403,7 +403,7 @@ class TlsGate:
             )
         except (OSError, ssl.SSLError) as error:
             self._refused(address, *why_failed(error))
-            # In a cycle with asyncio's TLS buffers: without this, strangers take 100 MB before they are collected.
+            # It forms a cycle with asyncio's TLS buffers: uncut, strangers take 100 MB before they are collected.
             error.__traceback__ = None
             return False
         _share_buffer(transport)
@@ -437,12 +437,12 @@ class TlsGate:
             self._is_through(task, owner)
 
         inside = PipeEnd(lost)
-        # Before gRPC can know of it.
+        # Must happen before gRPC learns of the connection.
         self._connections[peer] = _Connection(caller, outside, inside, task)
         self._of_name.setdefault(owner, OrderedDict())[peer] = None
         self._earliest_end.note(caller.identity.not_after)
         if caller.refusal is not None:
-            # It may hear from gRPC why, in words that its operator reads.
+            # gRPC may tell it why, in words that its operator reads.
             self._refused_member(caller.identity.name, address, caller.refusal)
             self._loop.call_later(HANDSHAKE_TIMEOUT_S, outside.abort)
         try:
@@ -483,7 +483,7 @@ class TlsGate:
             del self._of_name[name]
 
     def _check(self, certificate: bytes) -> Caller:
-        """Return the caller with its refusal, if any; raises CertificateError for one that is not even of our CA."""
+        """Return the caller with its refusal, if any; raises CertificateError for one that our CA did not issue."""
         try:
             return Caller(self._good(certificate), certificate)
         except CertificateError as error:
@@ -495,7 +495,7 @@ class TlsGate:
         return identity
 
     def _review(self, connection: _Connection) -> None:
-        """End the connection if its certificate is not good any more."""
+        """End the connection if its certificate is no longer valid."""
         caller = connection.caller
         if caller.refusal is not None:
             return
@@ -511,7 +511,7 @@ class TlsGate:
         self._loop.call_later(LAST_WORDS_S, connection.inside.abort)
 
     def _refused_member(self, name: NodeName, who: str, refusal: CertificateError) -> None:
-        """Of our CA's, so one that somebody may look for: told in any case, though not at each attempt."""
+        """Log a refused member of our CA, for which somebody may look: always, though not at each attempt."""
         self._on_refused(refusal.reason)
         now = self._loop.time()
         told_at = self._told.get((name, refusal.reason), -math.inf)
@@ -540,14 +540,14 @@ def _share_buffer(transport: asyncio.BaseTransport) -> None:
 
 
 def _has_spoken(sock: socket.socket) -> bool:
-    """Whether there is something to read now, its end included."""
+    """Return whether there is something to read now, including the end of the connection."""
     looking = select.poll()
     looking.register(sock, select.POLLIN)
     return bool(looking.poll(0))
 
 
 async def _readable(loop: asyncio.AbstractEventLoop, sock: socket.socket) -> None:
-    """Wait until there is something to read, the connection's end included."""
+    """Wait until there is something to read, including the end of the connection."""
     readable = loop.create_future()
 
     def found() -> None:
@@ -562,7 +562,7 @@ async def _readable(loop: asyncio.AbstractEventLoop, sock: socket.socket) -> Non
 
 
 def _source(address: str) -> str:
-    """What one sender of connections can hardly change: its IPv4 address, or its IPv6 network."""
+    """Return what a sender of connections can hardly change: its IPv4 address, or its IPv6 network."""
     with contextlib.suppress(ValueError):
         ip = ipaddress.ip_address(address.partition("%")[0])
         if isinstance(ip, ipaddress.IPv6Address):
