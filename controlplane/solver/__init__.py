@@ -1,1 +1,1 @@
-"""From an assignment problem to a plan within a time limit: decomposition, then CP-SAT."""
+"""Solves an assignment problem within a time limit: decomposition, then CP-SAT."""

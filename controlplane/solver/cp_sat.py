@@ -1,11 +1,11 @@
-"""What is left of an assignment problem after its decomposition, in CP-SAT; the only file that imports OR-Tools.
+"""Solves with CP-SAT what the decomposition of an assignment problem leaves open; only this file imports OR-Tools.
 
-It is imported when it is first needed, or once there is time for it (`prepare`): that takes more than a second of
-processor time, and after a restart, when a whole fleet comes back, most problems do without.
+OR-Tools is imported when it is first needed, or once there is time for it (`prepare`). The import takes more than a
+second of processor time, and after a restart, when a whole fleet comes back, most problems do not need it.
 
-Columns are whole choices of a block, so that every objective is linear. One worker and a fixed seed: the same columns
-give the same answer with the same version of OR-Tools. It releases the interpreter while it searches, hence a thread
-suffices to run it.
+Columns are whole choices of a block, so that every objective is linear. With one worker and a fixed seed, the same
+columns give the same answer in the same version of OR-Tools. CP-SAT releases the interpreter while it searches, hence
+a thread suffices to run it.
 """
 
 from __future__ import annotations
@@ -18,12 +18,11 @@ if TYPE_CHECKING:
     from typing import Any
 
 RESOLUTION = 1e-7
-"""CP-SAT counts in integers: two costs closer than this are the same to it. No posterior mean over less than a
-million requests is finer."""
+"""CP-SAT counts in integers: it cannot tell two costs apart that are closer than this. No posterior mean over less than
+a million requests is finer."""
 
 _LARGEST = 2.0**61
-"""What the objective of CP-SAT may come to: half of its integers. Costs that range further are counted in larger
-steps."""
+"""Largest objective for CP-SAT: half of its integer range. Costs that range further are counted in larger steps."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,22 +31,22 @@ class Column:
 
     cost: float
     excess: int
-    """By how many interfaces the block's own capacity is exceeded."""
+    """Number of interfaces beyond the block's own capacity."""
     limits: tuple[int, ...]
-    """For each interface that falls under a limit over all robots the number of that limit."""
+    """For each interface under a limit over all robots, the index of that limit."""
 
 
 def prepare() -> None:
-    """Import OR-Tools, so that the first problem that needs it does not wait for that."""
+    """Import OR-Tools, so that the first problem that needs it does not wait for the import."""
     import ortools.sat.python.cp_model  # noqa: F401
 
 
 def pick_columns(
     blocks: Sequence[Sequence[Column]], capacity: Sequence[int], hint: Sequence[int], *, time_limit_s: float
 ) -> tuple[list[int], bool]:
-    """For each block the column of the plan that exceeds capacities the least and, among those, costs the least.
+    """Choose a column for each block so that the plan exceeds capacities least and, among such plans, costs least.
 
-    Returns the hint if nothing better is found in time, and whether the answer is proven to be the best.
+    Returns these columns, or the hint if nothing better is found in time, and whether the answer is proven optimal.
     """
     from ortools.sat.python import cp_model
 

@@ -1,7 +1,7 @@
-"""The plan of blocks that share servers: decomposition first, then what it leaves open.
+"""Plans for blocks that share servers: decomposition first, then CP-SAT.
 
-What the decomposition leaves open between plan and bound is searched by CP-SAT, in a small group
-until the optimum is proven, in a large one only if the gap is wide.
+CP-SAT searches the gap that the decomposition leaves between plan and bound. In a small group it searches until the
+optimum is proven, in a large one only if the gap is wide.
 """
 
 from __future__ import annotations
@@ -27,27 +27,27 @@ log = logging.getLogger(__name__)
 
 TELL_AGAIN_S = 60.0
 MAX_TOLD = 1024
-"""Blocks that could not be solved and when that was said; then all may be told again."""
+"""Failed blocks remembered with the time of their log line; beyond that all are forgotten and may be logged again."""
 
 SMALL_BLOCKS = 64
-"""Groups of up to this many blocks are solved to the optimum, if the time allows."""
+"""Groups of up to this many blocks are solved to the optimum if time allows."""
 
 GOOD_GAP = 0.002
-"""The decomposition of a larger group ends when the plan costs at most this share more than the bound: below the
-resolution of any estimate."""
+"""The decomposition of a larger group ends when the plan costs at most this share more than the bound: less than any
+estimate resolves."""
 
 WANTED_GAP = 0.01
-"""A larger group is searched by CP-SAT only beyond this: that takes all the time there is, which robots whose network
-changes meanwhile spend waiting, and saves little."""
+"""CP-SAT searches a larger group only beyond this gap: the search takes all the time there is, saves little, and keeps
+robots waiting whose network changes meanwhile."""
 
 MIN_GROUP_TIME_S = 0.01
-"""Time a group of blocks gets for the search even when those before it used up the limit."""
+"""Time a group gets for the search even if the groups before it used up the limit."""
 
 MAX_COLUMNS = 30_000
-"""Choices of all blocks of a group that CP-SAT is given at most."""
+"""Most choices, over all blocks of a group, that CP-SAT is given."""
 
 COLUMNS_A_SECOND = 30_000
-"""How many are set up in a second; no more than there is time for."""
+"""Choices set up in a second; CP-SAT is given no more than there is time for."""
 
 MIN_COLUMNS_BLOCK = 4
 MAX_COLUMNS_BLOCK = 4096
@@ -55,28 +55,27 @@ MAX_COLUMNS_BLOCK = 4096
 
 @dataclass(frozen=True, slots=True)
 class Found:
-    """What one group's blocks choose."""
+    """The choices of one group's blocks."""
 
     choices: Mapping[BlockKey, Choice]
     bound: float
-    """No plan that exceeds capacities by no more costs less."""
+    """Lower bound on the cost of any plan that does not exceed capacities by more."""
     proven: bool
-    """Whether cost and bound are as close as wanted, and nothing can exceed less."""
+    """Whether cost and bound are as close as wanted, and no plan exceeds capacities by less."""
     prices: Mapping[FleetKey, float]
-    """Of the limits, to start from next time."""
+    """Prices of the limits, to start from next time."""
     worth: Mapping[BlockKey, float]
-    """What each block's best choice is worth at these prices: together, less the prices of the capacities, a bound
-    too."""
+    """Value of each block's best choice at these prices; their sum less the prices of the capacities is a bound too."""
 
 
 class FailureLog:
-    """Says which blocks could not be solved, each once in a minute."""
+    """Logs which blocks could not be solved, each once a minute."""
 
     def __init__(self) -> None:
         self._told: dict[BlockKey, float] = {}
 
     def note(self, key: BlockKey, error: Exception, now: float) -> None:
-        """Solving this block raised."""
+        """Log that solving this block raised."""
         if now - self._told.get(key, -math.inf) < TELL_AGAIN_S:
             return
         if len(self._told) >= MAX_TOLD:
@@ -89,8 +88,11 @@ _failures = FailureLog()
 
 
 def solve_group(group: Problem, end: float, hint: Plan | None, prices: Mapping[FleetKey, float]) -> Found:
-    """Solve a group. Should that fail, for a block that nobody foresaw, all others get a choice all the same: each its
-    best without regard to the limits that they share, and that one what it has."""
+    """Solve a group.
+
+    If that fails because of an unforeseen block, each other block gets its best choice, without regard to shared
+    limits, and the failed one keeps what it has.
+    """
     try:
         return GroupSolver(group, end).solve(hint, prices)
     except Exception as error:
@@ -108,7 +110,7 @@ def solve_group(group: Problem, end: float, hint: Plan | None, prices: Mapping[F
 
 
 def _at_hand(block: Block, hint: Plan | None) -> Choice:
-    """What the block has, if that is possible still, else its best path alone."""
+    """Return the block's present choice if that is still possible, else its best path alone."""
     kept = choice_of(block, hint.blocks.get(block.key)) if hint is not None else None
     if kept is not None:
         return kept
@@ -128,7 +130,7 @@ class GroupSolver:
         self._limits = Limits(group)
 
     def solve(self, hint: Plan | None, prices: Mapping[FleetKey, float]) -> Found:
-        """Start from the prices and the plan of before."""
+        """Solve the group, starting from the previous prices and plan."""
         decomposition = Decomposition(self._group, self._limits, prices)
         relaxed = decomposition.run(
             self._hinted(hint),
@@ -159,7 +161,7 @@ class GroupSolver:
         return relative_gap(cost, relaxed.bound, relaxed.standing.size) <= self._wanted_gap
 
     def _search(self, relaxed: Relaxed) -> tuple[dict[BlockKey, Choice], float, bool]:
-        """Let CP-SAT choose among the choices that the bound leaves a chance."""
+        """Let CP-SAT choose among the choices that the bound does not rule out."""
         standing, limits = relaxed.standing, self._limits
         margin = math.inf if relaxed.extra else standing.cost - relaxed.bound
         left_s = max(MIN_GROUP_TIME_S, self._end - time.monotonic())

@@ -1,8 +1,8 @@
-"""From an assignment problem to a plan, within a time limit; from problem to problem with what it learned.
+"""Solves one assignment problem after another, each within a time limit, and carries over what it learned.
 
-Blocks that share no limit over all robots get their best choice at once, the others by groups (`group_solver`). When
-few blocks of a large fleet changed since the last problem, only these choose anew, within the capacity that the others
-leave; the prices of the last whole solution tell how far from the best that is.
+Blocks that share no limit over all robots get their best choice at once, the others by groups (`group`). When few
+blocks of a large fleet have changed since the last problem, only these choose again, within the capacity that the
+others leave. The prices of the last whole solution tell how far from the optimum that is.
 """
 
 from __future__ import annotations
@@ -24,21 +24,21 @@ if TYPE_CHECKING:
     from controlplane.core.problem.problem import Block, BlockKey, Problem
 
 CHANGED_SHARE = 0.02
-"""Beyond this share of changed blocks all are solved: it costs little more, and moves others out of the way."""
+"""Beyond this share of changed blocks all are solved: that costs little more, and can move others out of the way."""
 
 INCREMENTAL_GAP = 0.01
-"""All blocks are solved again once the plan may cost this share more than the best, beyond what the last whole solution
-left open: solving all could not be sure to do better."""
+"""All blocks are solved again once the plan may cost this share more than the optimum, on top of the gap that the last
+whole solution left: within that gap, solving all might do no better."""
 
 
 def solve(problem: Problem, *, time_limit_s: float, hint: Plan | None = None) -> Plan:
-    """The plan for one problem, by a matcher that knows nothing from before."""
+    """Return the plan for one problem, by a matcher without history."""
     return Matcher().solve(problem, time_limit_s=time_limit_s, hint=hint)
 
 
 @dataclass(frozen=True, slots=True)
 class _Kept:
-    """The last problem with its plan, and what was learned of it."""
+    """The last problem with its plan, and what was learned from it."""
 
     problem: Problem
     blocks: Mapping[BlockKey, Block]
@@ -47,7 +47,7 @@ class _Kept:
     prices: Mapping[FleetKey, float]
     worth: Mapping[BlockKey, float]
     gap: float
-    """Of the last whole solution."""
+    """Gap of the last whole solution."""
 
 
 class Matcher:
@@ -56,13 +56,13 @@ class Matcher:
     def __init__(self) -> None:
         self._kept: _Kept | None = None
         self.incremental = 0
-        """Problems of which only what changed was solved."""
+        """Problems of which only the changed blocks were solved."""
 
     def solve(self, problem: Problem, *, time_limit_s: float, hint: Plan | None = None) -> Plan:
         """Find the plan with the least excess over the capacities and, among those, the least cost.
 
-        Groups of blocks that share no limit are solved one after the other within `time_limit_s` seconds together. A
-        group out of time keeps the best plan found, and counts as unproven.
+        Groups that share no limit with each other are solved one after the other, within `time_limit_s` seconds in all.
+        A group that runs out of time keeps the best plan found, and counts as unproven.
         """
         end = time.monotonic() + time_limit_s
         kept = self._kept
@@ -93,7 +93,7 @@ class Matcher:
         return plan
 
     def _solve_changed(self, problem: Problem, kept: _Kept, end: float) -> Plan | None:
-        """The plan, if it can be had by solving the changed blocks alone, and is good."""
+        """Return the plan that solves the changed blocks alone; None if that is not possible or not good enough."""
         last = kept.problem
         same_frame = (problem.objective, problem.fleet_capacity) == (last.objective, last.fleet_capacity)
         if not same_frame or kept.plan.fleet_excess or len(problem.blocks) <= SMALL_BLOCKS:
@@ -134,7 +134,7 @@ class Matcher:
 
 
 def _groups(problem: Problem) -> list[Problem]:
-    """The groups that share a limit, and all other blocks together."""
+    """Return the groups of blocks that share a limit, and all other blocks together."""
     groups = independent_groups(problem)
     free = tuple(block for group in groups if not group.fleet_capacity for block in group.blocks)
     bound = [group for group in groups if group.fleet_capacity]
@@ -142,7 +142,7 @@ def _groups(problem: Problem) -> list[Problem]:
 
 
 def _part(problem: Problem, changed: Iterable[Block], free: Mapping[FleetKey, int]) -> Problem | None:
-    """The changed blocks without the servers that the others fill; None if that takes an interface its last one."""
+    """Return the changed blocks without the servers that the others fill; None if an interface would have none left."""
     blocks = []
     for block in changed:
         full = {server for server in block.servers if free.get(FleetKey(server, block.key.service), 1) <= 0}
@@ -160,13 +160,13 @@ def _part(problem: Problem, changed: Iterable[Block], free: Mapping[FleetKey, in
 
 
 def _loads(problem: Problem, plan: Plan, keys: Iterable[BlockKey]) -> Counter[FleetKey]:
-    """Interfaces that these blocks of a plan give each server with a limit."""
+    """Count the interfaces that these blocks of a plan assign to each server with a limit."""
     used = (FleetKey(server, key.service) for key in keys for _, server in plan.blocks[key].assignments)
     return Counter(key for key in used if key in problem.fleet_capacity)
 
 
 def _worth(problem: Problem, prices: Mapping[FleetKey, float]) -> dict[BlockKey, float]:
-    """What blocks are worth at least at these prices."""
+    """Return the least value of each block at these prices."""
     limits = Limits(problem)
     decomposition = Decomposition(problem, limits, prices)
     return decomposition.worth(decomposition.start)
