@@ -35,12 +35,12 @@ if TYPE_CHECKING:
 
     from protos.program.arguments import Commands
 
-# Each command imports what it needs when it is the one that is asked for: `plr status` is used where each second
-# counts, and what all commands import together takes longer than its answer.
+# Each command imports what it needs only when it is called: `plr status` is used where each second counts, and the
+# imports of all commands together take longer than its answer.
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the program; returns its exit code."""
+    """Run the program and return its exit code."""
     argv = sys.argv[1:] if argv is None else argv
     with extras.required("plr", "controlplane"):
         parser = _parser(argv[0] if argv else "")
@@ -130,7 +130,7 @@ _COMMANDS: dict[str, tuple[str, Callable[[Commands, str], None]]] = {
     "config": ("about configuration files", _config),
     "policy": ("about the access policy in a control plane's configuration", _policy),
 }
-"""By name: what it is for, and what adds its options."""
+"""Purpose of each command, and the function that adds its options, by name."""
 
 
 _ON_A_NODE = {
@@ -138,7 +138,7 @@ _ON_A_NODE = {
     "ping": "on a robot or a server: how long each path to a peer takes",
     "bugreport": "on a robot or a server: a tar file for whoever helps",
 }
-"""The sidecar's, which never come here (`protos.program.command_line`): to be listed, and found by who mistypes one."""
+"""The sidecar's commands, which never come here (`protos.program.command_line`): listed, and suggested after a typo."""
 
 
 if __name__ == "__main__":

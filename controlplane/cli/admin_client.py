@@ -1,4 +1,4 @@
-"""How `plr` asks a running control plane: its options, the connection, and what goes wrong in one line."""
+"""Asks a running control plane for `plr`: the options, the connection, and errors in one line."""
 
 from __future__ import annotations
 
@@ -33,11 +33,11 @@ EXIT_FAILED = 1
 EXIT_USAGE = 2
 
 _OPTIONS = (
-    # A thousand robots with their paths and histograms are more than gRPC's default of 4 MiB.
+    # A thousand robots with their paths and histograms exceed gRPC's default of 4 MiB.
     ("grpc.max_receive_message_length", 256 << 20),
     # Behaviour comes from the command line, not from the environment.
     ("grpc.enable_http_proxy", 0),
-    # Whatever its address: the name in the certificate of every control plane of the fleet.
+    # The name in the certificate of every control plane of the fleet, whatever its address.
     ("grpc.ssl_target_name_override", CONTROL_PLANE_DNS),
 )
 
@@ -49,7 +49,7 @@ _NO_IDENTITY = (
 
 
 class AskError(Exception):
-    """There is no answer; the text is one line, fit for a terminal, and `code` the exit code for it."""
+    """There is no answer; the text is one line for a terminal, and `code` its exit code."""
 
     def __init__(self, text: str, code: int) -> None:
         super().__init__(escaped(text))
@@ -57,7 +57,7 @@ class AskError(Exception):
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
-    """Add the options that say which control plane is asked, by whom, and how the answer is printed."""
+    """Add the options that choose the control plane, the identity of the asker, and how the answer is printed."""
     parser.add_argument("--address", type=_address, default=DEFAULT_ADDRESS, metavar="HOST:PORT")
     security = parser.add_mutually_exclusive_group()
     security.add_argument(
@@ -76,7 +76,7 @@ def _address(text: str) -> str:
 
 
 def ask(arguments: argparse.Namespace, call: Callable[[admin_pb2_grpc.AdminStub, float], A]) -> A:
-    """Make a call with the stub and the time limit in seconds; returns what it returns.
+    """Run `call` with the stub and the time limit in seconds, and return its result.
 
     Raises:
         AskError: no answer, or not one that could be converted (`call` raised DecodeError).
@@ -90,7 +90,7 @@ def ask(arguments: argparse.Namespace, call: Callable[[admin_pb2_grpc.AdminStub,
         with _open_channel(address, files) as channel:
             return call(admin_pb2_grpc.AdminStub(channel), arguments.timeout_s)
     except grpc.RpcError as error:
-        # The error of a call is the call itself, which the stubs do not say.
+        # The error of a call is the call itself, which the type stubs do not declare.
         detail = " ".join(str(getattr(error, "details", error.__str__)()).split())
         code = getattr(error, "code", lambda: None)()
         if code is grpc.StatusCode.NOT_FOUND:
@@ -113,7 +113,7 @@ def _late(timeout_s: float) -> str:
 
 
 def _advice(detail: str, files: TlsFiles | None) -> str | None:
-    """What gRPC's words for a failed connection mean, and what to do; None if they have to speak for themselves."""
+    """Return what gRPC's text for a failed connection means, and what to do; None if there is nothing to add."""
     if "Connection refused" in detail:
         return (
             "nobody listens there (TCP): see whether the control plane runs, and give the address of its "

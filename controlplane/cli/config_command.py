@@ -1,4 +1,4 @@
-"""`plr config`: which keys a program's configuration has."""
+"""`plr config`: shows which keys a program's configuration has."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def add_to(commands: Commands, summary: str) -> None:
 
 def _schema(arguments: argparse.Namespace) -> int:
     if arguments.program == "sidecar":
-        # The planes do not import each other: the program that has these keys is asked.
+        # The planes do not import each other: ask the program that has these keys.
         return subprocess.run([sys.executable, "-m", "sidecar", "--print-schema"], check=False).returncode
     sys.stdout.write(json.dumps(ControlPlaneConfig.model_json_schema(), indent=2) + "\n")
     return EXIT_OK

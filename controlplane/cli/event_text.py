@@ -1,4 +1,4 @@
-"""Events and departures as text for a terminal."""
+"""Formats events and departures as text for a terminal."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from protos.model.fleet_events import DepartedSidecar, FleetEvent
 
 SHOWN = 20
-"""Sidecars that are gone in the text of a status."""
+"""Departed sidecars shown in the text of a status."""
 
 WORDS = {
     Why.LEASE_EXPIRED: "silent for longer than its lease",
@@ -27,7 +27,7 @@ WORDS = {
 
 
 def line(event: FleetEvent) -> str:
-    """One event on one line."""
+    """Return an event as one line."""
     at = datetime.fromtimestamp(event.at, UTC).strftime("%Y-%m-%d %H:%M:%S")
     who = event.node or "control plane"
     about = [f"{event.why.value}: {WORDS[event.why]}"] if event.why is not None else []
@@ -37,7 +37,7 @@ def line(event: FleetEvent) -> str:
 
 
 def departed(gone: Sequence[DepartedSidecar], left_out: int) -> Iterator[str]:
-    """Who is gone, who went last first."""
+    """Yield the sidecars that are gone, the last to go first."""
     if not gone:
         return
     yield "gone, the last first:"
@@ -61,7 +61,7 @@ def departed(gone: Sequence[DepartedSidecar], left_out: int) -> Iterator[str]:
 
 
 def events(last: Sequence[FleetEvent], state: EventLogState) -> Iterator[str]:
-    """The last events, and what is wrong with their log."""
+    """Yield the last events, and what is wrong with their log."""
     if last:
         yield "last events (plr events shows more):"
         yield from (f"  {line(event)}" for event in last)
@@ -72,7 +72,7 @@ def events(last: Sequence[FleetEvent], state: EventLogState) -> Iterator[str]:
 
 
 def age(seconds: float) -> str:
-    """A span of time in its largest unit."""
+    """Return a span of time in its largest unit."""
     for unit, length in (("d", 86_400.0), ("h", 3600.0), ("min", 60.0)):
         if seconds >= 2 * length:
             return f"{seconds / length:.0f} {unit}"

@@ -1,4 +1,4 @@
-"""`plr events`: what happened in the fleet, as the control plane's log of events has it."""
+"""`plr events`: shows what happened in the fleet, from the control plane's event log."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ EXIT_OK = 0
 LAST = 100
 
 FOLLOW_S = 2.0
-"""From one look to the next."""
+"""Interval between two queries with --follow."""
 
 _UNITS_S = {"s": 1.0, "m": 60.0, "h": 3600.0, "d": 86_400.0}
 
@@ -114,7 +114,7 @@ def _ask(arguments: argparse.Namespace, query: EventQuery) -> EventList:
 
 
 def _follow(arguments: argparse.Namespace, query: EventQuery) -> EventList:
-    """Ask until there is an answer: a control plane that restarts is just what one follows."""
+    """Ask until there is an answer: a restart of the control plane is just what one wants to follow."""
     told = False
     while True:
         try:

@@ -1,4 +1,4 @@
-"""`plr explain`: why a robot's requests for a service go where they go."""
+"""`plr explain`: shows why a robot's requests for a service go where they go."""
 
 from __future__ import annotations
 

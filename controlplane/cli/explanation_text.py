@@ -1,4 +1,4 @@
-"""An explanation as text for a terminal."""
+"""Formats an explanation as text for a terminal."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ if TYPE_CHECKING:
     from protos.model.mapping import Assignment
 
 LEAST_SHOWN = 1e-9
-"""No smaller probability is worth telling: it would take years to see one miss."""
+"""Smallest probability worth showing: with less it would take years to see one miss."""
 
 LITTLE_GAIN = 0.5
-"""Share of what the better interface misses that the other misses as well, from which on that one gains little."""
+"""If the other interface misses at least this share of what the better one misses, it gains little."""
 
 _PAIR_HEADER = (
     *("", "INTERFACE", "SERVER", "STATE", "MISS", "90 % BETWEEN", "REQUESTS", "PROBES"),
@@ -28,7 +28,7 @@ _PAIR_HEADER = (
 
 
 def render(explanation: Explanation) -> str:
-    """The mapping in force, what it rests on, what else there is, and how it came about."""
+    """Return the mapping in force, what it is based on, the alternatives, and how it came about."""
     found = explanation
     kind = "idempotent" if found.idempotent else "not idempotent: one server at a time"
     aim = f"cheapest that misses at most {found.target_miss:g}" if found.target_miss else f"objective {found.objective}"
@@ -115,7 +115,7 @@ def _penalties(found: Explanation) -> list[tuple[str, ...]]:
 
 
 def _witnesses(found: Explanation) -> list[tuple[str, ...]]:
-    """One line for each server; nothing where this robot alone calls it."""
+    """Return a line for each server, except those that only this robot calls."""
     of_servers = {pair.path.server: pair for pair in found.pairs if pair.witnesses}
     return [
         (
@@ -156,7 +156,7 @@ def _joint(joint: JointExplanation) -> tuple[str, ...]:
 
 
 def _gain(joint: JointExplanation) -> str:
-    """What failing together means for a copy over the second interface."""
+    """Return what joint failures mean for a copy over the second interface."""
     if joint.correlation is Correlation.INDEPENDENT:
         return ""
     rarer = min(joint.first_missed, joint.second_missed)

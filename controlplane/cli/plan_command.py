@@ -1,4 +1,4 @@
-"""`plr plan`: how many interfaces and servers it takes to meet a target, from what was recorded, without a network."""
+"""`plr plan`: predicts from recordings, without a network, how many interfaces and servers meet a target."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ EXIT_NOT_MET = 1
 EXIT_USAGE = 2
 
 MAX_REQUESTS = 5_000_000
-"""Requests sent through traces in one run: some minutes."""
+"""Most requests sent through traces in one run: some minutes."""
 
 MAX_MESSAGE_BYTES = 1 << 24
 
@@ -50,7 +50,7 @@ exit codes: 0 done (with --target: some set meets it), 1 no set meets the target
 
 
 class _UsageError(Exception):
-    """One line for the user."""
+    """The command cannot be carried out; the text is one line for the user."""
 
 
 def add_to(commands: Commands, summary: str) -> None:
@@ -117,7 +117,7 @@ def _compute(text: str) -> Compute:
 
 
 def _given(arguments: argparse.Namespace) -> dict[str, Any]:
-    """What was said of the workload."""
+    """Return the workload options that were given."""
     keys = (field.name for field in fields(Workload))
     return {key: getattr(arguments, key) for key in keys if getattr(arguments, key) is not None}
 
@@ -127,7 +127,7 @@ def _plan(arguments: argparse.Namespace) -> int:
     if lacking is not None:
         sys.stderr.write(f"plr plan: {lacking}\n")
         return EXIT_USAGE
-    # With numpy, which an operator who only asks does without.
+    # This imports numpy, which an operator who only queries does not need.
     from controlplane.planning.recorded import RecordingError
 
     try:
@@ -191,12 +191,12 @@ def _read(paths: Sequence[Path]) -> list[RecordedPaths]:
 
 
 def _inside(path: Path) -> list[Path]:
-    """The traces of a folder; of anything else itself."""
+    """Return the traces in a folder; for any other path, the path itself."""
     try:
         names = sorted(os.listdir(path))
     except NotADirectoryError:
         return [path]
     except (OSError, ValueError) as error:
-        # A name with a NUL, or too long for one, is not asked about in the file system.
+        # A name that contains a NUL, or is too long, is never looked up in the file system.
         raise _UsageError(f"{path}: cannot be read: {getattr(error, 'strerror', None) or error}") from None
     return [path / name for name in names if name.endswith((".csv", ".csv.gz"))]

@@ -1,4 +1,4 @@
-"""`plr policy`: what the access policy of a configuration file says, without a running control plane."""
+"""`plr policy`: shows what the access policy of a configuration file says, without a running control plane."""
 
 from __future__ import annotations
 

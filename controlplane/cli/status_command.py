@@ -1,4 +1,4 @@
-"""`plr status`: who is connected, how far each follows, and who is gone."""
+"""`plr status`: shows who is connected, how far each follows, and who is gone."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ if TYPE_CHECKING:
 EXIT_OK = 0
 
 DETAILED_AT_MOST = 64
-"""Sidecars shown with their mapping and paths though they are in order: some screens full."""
+"""Most sidecars in order that are still shown with their mapping and paths: a few screens full."""
 
 _EPILOG = """\
 shows: one row a sidecar; then mapping and paths of each, of a fleet of more than 64 only where something is wrong;
@@ -65,15 +65,15 @@ def add_to(commands: Commands, summary: str) -> None:
 
 @dataclass(slots=True)
 class _Answer:
-    """What has come so far: converted as it comes, and, for JSON, as it is."""
+    """The parts received so far: converted as they come and, for JSON, unchanged."""
 
     raw: admin_pb2.GetStatusResponse | None
     rest: admin_pb2.GetStatusResponse = field(default_factory=admin_pb2.GetStatusResponse)
-    """Without sidecars."""
+    """The answer without sidecars."""
     sidecars: list[SidecarStatus] = field(default_factory=list)
 
     def take(self, part: admin_pb2.GetStatusResponse) -> None:
-        """Raises DecodeError."""
+        """Add a part of the answer; raises DecodeError."""
         self.sidecars += status_from_proto(part)
         if len(self.sidecars) > MAX_SIDECARS:
             raise DecodeError(f"sidecars has more than {MAX_SIDECARS} elements")
@@ -114,7 +114,7 @@ def _parts(
     except grpc.RpcError as error:
         if getattr(error, "code", lambda: None)() is not grpc.StatusCode.UNIMPLEMENTED:
             raise
-        # A control plane of the version before.
+        # The control plane has the previous version.
         whole = stub.GetStatus(admin_pb2.GetStatusRequest(), timeout=timeout_s)
         if query.names:
             kept = [sidecar for sidecar in whole.sidecars if sidecar.peer.name in query.names]
@@ -144,7 +144,7 @@ def _text(answer: _Answer, names: Sequence[NodeName]) -> str:
 
 
 def _json(answer: admin_pb2.GetStatusResponse) -> str:
-    """Return the answer in protobuf's JSON, but addresses as people write them: bytes would be base64."""
+    """Return the answer as protobuf's JSON, but with readable addresses: bytes would be base64."""
     import base64
     import json
     from ipaddress import ip_address

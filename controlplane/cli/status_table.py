@@ -1,4 +1,4 @@
-"""The status of all sidecars as text for a terminal."""
+"""Formats the status of all sidecars as text for a terminal."""
 
 from __future__ import annotations
 
@@ -19,17 +19,17 @@ if TYPE_CHECKING:
     from protos.model.status import ResourceStatus, SidecarStatus
 
 MAX_LINES = 256
-"""On one sidecar: what it says that it offers, lacks or reaches must not hide the others."""
+"""Most lines on one sidecar: its claims of what it offers, lacks or reaches must not hide the others."""
 
 MAX_LINE = 1000
-"""Characters of each."""
+"""Characters of each line."""
 
 MAX_HINTED = 100
-"""Characters of a service's name for which a similar one is sought."""
+"""Longest service name, in characters, for which a similar one is sought."""
 MAX_CLOSE = 8
-"""Similar names, of which a cloud may offer some itself."""
+"""Similar names considered, since a cloud may offer some of them itself."""
 MAX_COMPARED = 20_000_000
-"""Pairs of characters that are compared in all, in a second at most: 1,000 names with 50 others of 20 characters."""
+"""Pairs of characters compared in all, at most a second's work: 1,000 names with 50 others of 20 characters."""
 
 _DAY_S = 86_400.0
 
@@ -37,11 +37,11 @@ _HEADER = ("NAME", "ROLE", "STREAM", "LEASE", "PEERS", "MAPPING", "SERVICES", "S
 
 
 def render(sidecars: Sequence[SidecarStatus], own: RevocationSet = NO_REVOCATIONS, now_wall: float = 0.0) -> str:
-    """One row a sidecar, then what each robot was told and on which paths it rests.
+    """Return one row a sidecar, then the mapping that each robot was sent and the paths that it is based on.
 
-    `own`: the revocation lists of the control plane; `now_wall`: seconds since 1970.
+    `own` holds the revocation lists of the control plane; `now_wall` is seconds since 1970.
     """
-    # What others say that they have is no proof of a newer list.
+    # What others claim to have is no proof of a newer list.
     of_own = {one.ca: one.number for one in own.lists}
     about_own = _revocations(own, of_own, now_wall)
     lines = [f"control plane: {line}" for line in about_own]
@@ -85,7 +85,7 @@ def _row(status: SidecarStatus) -> tuple[str, ...]:
 
 
 def _details(status: SidecarStatus) -> Iterator[tuple[str, bool]]:
-    """Lines, and whether each is about something that is wrong."""
+    """Yield lines, and whether each is about something that is wrong."""
     for name, resource in (("peers", status.peers), ("mapping", status.mapping)):
         if resource.state is SyncState.REJECTED:
             yield f"{name} {_rejection(resource)}", True
@@ -111,7 +111,8 @@ def _unserved(status: SidecarStatus) -> Iterator[str]:
 
 
 class _Hints:
-    """Which offered service somebody may mean. Many robots ask for one; and no member makes the operator wait."""
+    """Guesses which offered service is meant: cached, since many robots want the same, and bounded, since no member may
+    make the operator wait."""
 
     def __init__(self, offered: Iterable[str]) -> None:
         self._offered = sorted(name for name in offered if len(name) <= MAX_HINTED)
@@ -119,7 +120,7 @@ class _Hints:
         self._left = MAX_COMPARED
 
     def of(self, name: str, but: Collection[str]) -> str:
-        """The closest name that is none of `but`, as the end of a line."""
+        """Return the closest name that is not in `but`, as the end of a line."""
         if len(name) > MAX_HINTED:
             return ""
         if name not in self._found:
@@ -132,7 +133,7 @@ class _Hints:
 def _unmet(status: SidecarStatus, hints: _Hints) -> Iterator[str]:
     own = {offer.name for offer in status.peer.offers}
     for name in status.unmet:
-        hint = hints.of(name, own)  # a cloud did not mean what it offers anyway
+        hint = hints.of(name, own)  # a cloud does not mean what it offers itself
         whose = "no server that it knows of" if status.peer.role is Role.ROBOT else "no node there"
         why = "" if status.peer.role is Role.ROBOT else ", or none that can be called; plr doctor there says which"
         yield f"UNMET {name}: configured, and {whose} offers it{hint or why}"
@@ -147,7 +148,7 @@ def _untyped(status: SidecarStatus) -> Iterator[str]:
 
 
 def _revocations(held: RevocationSet, of_own: Mapping[int, int], now_wall: float) -> Iterator[str]:
-    """`of_own`: the number of the control plane's own list, by CA."""
+    """Yield a line for each list held; `of_own` has the numbers of the control plane's own lists, by CA."""
     for one in held.lists:
         age_s = now_wall - one.signed_at_s
         age = f"{age_s / _DAY_S:.1f} days ago" if age_s >= 0.0 else f"{-age_s:.0f} s FROM NOW: a clock is wrong"

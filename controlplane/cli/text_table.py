@@ -1,4 +1,4 @@
-"""Aligned columns for a terminal. What one member says takes its own line, and no more of it than can be read."""
+"""Aligns columns for a terminal. Text of one member stays on its own line, and is cut to a readable length."""
 
 from __future__ import annotations
 
@@ -8,14 +8,14 @@ if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
 MAX_PADDED = 64
-"""Characters: a column is no wider for others, however long one cell is."""
+"""Widest padding in characters: one long cell does not widen the column for the others."""
 
 MAX_LISTED = 100
 """Characters of a list in one cell."""
 
 
 def columns(rows: Sequence[Sequence[str]]) -> Iterator[str]:
-    """A line for each row, each column as wide as its widest cell, up to MAX_PADDED."""
+    """Yield a line for each row, each column as wide as its widest cell, up to MAX_PADDED."""
     if not rows:
         return
     widths = [min(max(len(cell) for cell in column), MAX_PADDED) for column in zip(*rows, strict=True)]
@@ -24,7 +24,7 @@ def columns(rows: Sequence[Sequence[str]]) -> Iterator[str]:
 
 
 def listed(names: Sequence[str]) -> str:
-    """The first of these in one cell, one at least, and how many more there are; "-" without any."""
+    """Return the first of these for one cell, at least one, and how many more there are; "-" if there are none."""
     if not names:
         return "-"
     shown = [shortened(names[0], MAX_LISTED)]
@@ -39,7 +39,7 @@ def listed(names: Sequence[str]) -> str:
 
 
 def shortened(text: str, most: int) -> str:
-    """Cut in the middle what has more than `most` characters."""
+    """Cut out the middle of a text of more than `most` characters."""
     if len(text) <= most:
         return text
     end = (most - 3) // 2
