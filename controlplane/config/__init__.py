@@ -1,1 +1,1 @@
-"""The control plane's configuration file, and its access policy."""
+"""The control plane's configuration file and access policy."""

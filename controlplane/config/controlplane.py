@@ -1,4 +1,4 @@
-"""Configuration of the control plane: read and checked once, then frozen and passed in."""
+"""Reads and checks the configuration of the control plane once; it is then frozen and passed in."""
 
 from __future__ import annotations
 
@@ -27,16 +27,16 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 RECONNECT_MAX_MS = 10_000
-"""Sidecars try again at most this far apart."""
+"""Longest pause between a sidecar's attempts to reconnect."""
 
 
 def _empty_if_null(value: object) -> object:
-    # "policy:" with nothing after it denies everything; it must not be taken for no policy, which allows everything.
+    # "policy:" with nothing after it denies everything. It must not be taken for no policy, which allows everything.
     return {} if value is None else value
 
 
 class PathRuleConfig(BaseModel):
-    """Over these interfaces of these robots requests may go to these clouds, or may not."""
+    """Allows or denies requests over these interfaces of these robots to these clouds."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -153,7 +153,7 @@ class ControlPlaneConfig(BaseModel):
         return self
 
     def settings(self) -> Settings:
-        """What the core needs of it, in seconds."""
+        """Return the core's settings, in seconds."""
         return Settings(
             lease_s=self.lease_ms / 1000,
             report_interval_s=self.report_interval_ms / 1000,

@@ -1,4 +1,4 @@
-"""Lists of patterns of names, as several keys of the configuration hold them."""
+"""Defines the lists of name patterns that several keys of the configuration hold."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _EXAMPLES = {
 
 
 def one_or_list(value: object) -> object:
-    """A text may stand for a list of one."""
+    """Return a list of one for a single text, else the value itself."""
     return (value,) if isinstance(value, str) else value
 
 

@@ -1,4 +1,4 @@
-"""The `policy` key of the configuration, turned into the core's rules."""
+"""Turns the `policy` key of the configuration into the core's rules."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ class PolicyConfig(BaseModel):
     )
 
     def policy(self) -> Policy:
-        """The rules as the core has them."""
+        """Return the core's rules."""
         return Policy(
             calls=tuple(CallRule(rule.robots, rule.services, rule.clouds) for rule in self.calls),
             offers=tuple(OfferRule(rule.clouds, rule.services) for rule in self.offers),

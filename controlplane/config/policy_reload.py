@@ -1,7 +1,7 @@
-"""Takes a new access policy from the configuration file while running, when told to (SIGHUP).
+"""Reloads the access policy from the configuration file while running, on SIGHUP.
 
-When told, and not whenever the file changes: a file that an editor has saved half must not decide who may do what.
-What cannot be read or is not in order leaves the policy in force.
+It does not react to changes of the file: a half-saved file must not decide who may do what. If the file cannot be read
+or is invalid, the policy in force stays.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ log = logging.getLogger(__name__)
 
 
 def doubt(policy: Policy | None) -> str | None:
-    """What is worth a warning of a policy, or of having none."""
+    """Return a warning about a policy, or about having none; None if there is nothing to warn of."""
     if policy is None:
         return "there is no policy: every robot may call, and every cloud may offer, every service"
     if policy.calls and policy.offers:
@@ -35,7 +35,7 @@ def doubt(policy: Policy | None) -> str | None:
 
 
 def announce(policy: Policy | None) -> None:
-    """Log what is in force."""
+    """Log the policy in force."""
     problem = doubt(policy)
     if problem is not None:
         log.warning("%s", problem)
@@ -56,7 +56,7 @@ class PolicyReload:
         self._requested.set()
 
     async def run(self, apply: Callable[[Policy | None], None], metrics: Metrics) -> None:
-        """Serve requests until cancelled; `apply` puts a policy in force."""
+        """Serve requests until cancelled; `apply` puts a policy into force."""
         announce(self._config.settings().policy)
         while True:
             await self._requested.wait()
