@@ -1,1 +1,1 @@
-"""What the control plane shows and remembers: metrics, and the log of events."""
+"""Metrics and the event log of the control plane."""

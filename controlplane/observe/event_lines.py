@@ -1,4 +1,4 @@
-"""One event as a line of JSON: in the control plane's file, and for `plr events --json`."""
+"""Encodes an event as a line of JSON, for the control plane's file and `plr events --json`."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ E = TypeVar("E", bound="enum.Enum")
 
 
 def encode(event: FleetEvent) -> str:
-    """Return the line, without its end."""
+    """Return the line without its line end."""
     shown: dict[str, Any] = {"number": event.number, "at": timestamp(event.at), "kind": event.kind.value}
     if event.node is not None:
         shown["node"] = event.node
@@ -39,7 +39,7 @@ def encode(event: FleetEvent) -> str:
 
 
 def decode(line: bytes) -> FleetEvent:
-    """Read a line. Raises DecodeError if it is not one of ours, or damaged."""
+    """Parse a line; raises DecodeError if it is not one of ours, or damaged."""
     if len(line) > MAX_LINE_BYTES:
         raise DecodeError("the line is too long")
     try:
@@ -71,7 +71,7 @@ def decode(line: bytes) -> FleetEvent:
 
 
 def timestamp(at: float) -> str:
-    """Seconds since 1970 as people and programs read them, in UTC."""
+    """Return seconds since 1970 as a UTC timestamp that people and programs can read."""
     return datetime.fromtimestamp(at, UTC).isoformat(timespec="milliseconds").replace("+00:00", "Z")
 
 

@@ -1,11 +1,11 @@
-"""The log of events: remembered here, and kept in a file that outlives the program.
+"""Keeps the event log, in memory and in a file that outlives the program.
 
     state_dir/events.jsonl   one event a line, JSON (`event_lines`); appended to
     state_dir/lock           held while the program runs, and touched: its time tells the next run when this one ended
 
-The file is bounded: when it has grown to MAX_FILE_BYTES it is written anew, with what is remembered. So it is also when
-writing has failed: a full disk costs nothing but time, as long as the program lives. Lines that are damaged (a power
-cut amid one, a bad sector) are skipped and counted. A thread of its own writes: a slow disk holds up nobody.
+The file is bounded: when it has grown to MAX_FILE_BYTES it is rewritten from memory. It is also rewritten after a
+failed write: a full disk costs nothing but time, as long as the program lives. Damaged lines (a power cut within one, a
+bad sector) are skipped and counted. A thread of its own writes: a slow disk holds up nobody.
 """
 
 from __future__ import annotations
@@ -42,19 +42,19 @@ FILE = "events.jsonl"
 LOCK_FILE = "lock"
 
 MAX_FILE_BYTES = 8 << 20
-"""Then the file is written anew: what is remembered takes half of it at most."""
+"""Size at which the file is rewritten: the events in memory take half of it at most."""
 
 MAX_UNWRITTEN = 4096
-"""Events that wait for the disk; beyond that the file is written anew as a whole."""
+"""Events that may wait for the disk; beyond that the whole file is rewritten."""
 
 RETRY_S = 10.0
-"""From a failed writing to the next attempt."""
+"""Pause between a failed write and the next attempt."""
 
 TOUCH_EVERY_S = 10.0
-"""How exactly the next run knows when this one ended, if nothing happened shortly before."""
+"""How precisely the next run knows when this one ended, if nothing happened shortly before."""
 
 CLOSE_TIMEOUT_S = 2.0
-"""For the last lines: a slow disk must not hold up a stop."""
+"""Time limit for writing the last lines: a slow disk must not hold up a stop."""
 
 
 class EventLog:
@@ -86,7 +86,7 @@ class EventLog:
         self._lock: IO[bytes] | None = None
         self._writer: threading.Thread | None = None
         self.ran_until: float | None = None
-        """When the run before was there last, in seconds since 1970; None if none is remembered."""
+        """When the previous run was last alive, in seconds since 1970; None if none is known."""
         if folder is None:
             return
         if self._open(folder):
@@ -94,7 +94,7 @@ class EventLog:
             self._writer.start()
 
     def announce(self) -> None:
-        """Log what is wrong with it. Not at once: a program that does not start has other things to say."""
+        """Log what is wrong with the log; not at once, since a program that fails to start has other things to say."""
         if self._path is None:
             log.info("events are kept in memory only, and a restart forgets who is gone: state_dir is not set")
         elif self._problem:
@@ -114,7 +114,7 @@ class EventLog:
         why: Why | None = None,
         seen_s: float | None = None,
     ) -> None:
-        """Something happened; `seen_s`: how long ago one that departed was heard of last."""
+        """Record an event; `seen_s` is how long ago a departed member was last heard from."""
         if not self._memory.admits(node, self._clock()):
             if node is not None and (node in self._suppressed or len(self._suppressed) < MAX_UNWRITTEN):
                 self._suppressed[node] = self._suppressed.get(node, 0) + 1
@@ -122,7 +122,7 @@ class EventLog:
         if node is not None and (more := self._suppressed.pop(node, 0)):
             text = f"{text} (and {more} events before it that were too many to keep)"
         at = self._wall()
-        # Grows also over a log that was lost: who asks for what is new must not wait for numbers to catch up.
+        # Numbers grow even after the log was lost: a client that asks for new events must not wait for a catch-up.
         number = max(self._memory.last_number + 1, int(at * 1e6))
         seen_at = at - seen_s if seen_s is not None else None
         event = FleetEvent(number, at, kind, node, clean_text(text.strip()), role, why, seen_at)
@@ -137,15 +137,15 @@ class EventLog:
             self._condition.notify()
 
     def events(self) -> list[FleetEvent]:
-        """All that are remembered, the oldest first."""
+        """Return all events in memory, the oldest first."""
         return list(self._memory)
 
     def last(self, count: int) -> list[FleetEvent]:
-        """The last ones, the oldest first."""
+        """Return the last `count` events, the oldest first."""
         return self._memory.last(count)
 
     def find(self, query: EventQuery) -> tuple[list[FleetEvent], int]:
-        """What is asked for, the oldest first, and how many older ones `query.last` leaves out."""
+        """Return the events that match, the oldest first, and how many older ones `query.last` leaves out."""
         found = [
             event
             for event in self._memory
@@ -158,7 +158,7 @@ class EventLog:
 
     @property
     def state(self) -> EventLogState:
-        """How it is doing."""
+        """State of the log."""
         return EventLogState(
             kept=len(self._memory),
             evicted=self._memory.evicted,
@@ -170,7 +170,7 @@ class EventLog:
         )
 
     def close(self) -> None:
-        """Write what is still unwritten, if the disk takes it soon."""
+        """Write what is still unwritten, if the disk takes it in time."""
         if self._writer is None:
             return
         with self._condition:
@@ -218,7 +218,7 @@ class EventLog:
 
     def _touch(self) -> None:
         assert self._lock is not None
-        # Whoever cannot even do this loses no event; the next run dates by the last event then.
+        # A failure here loses no event; the next run then takes the last event for the end of this one.
         with contextlib.suppress(OSError, ValueError):
             at = self._wall()
             os.utime(self._lock.fileno(), (at, at))
@@ -232,7 +232,7 @@ class EventLog:
             size = file.seek(0, os.SEEK_END)
             file.seek(max(0, size - 2 * MAX_FILE_BYTES))
             data = file.read(2 * MAX_FILE_BYTES)
-        # What is appended must not join a line that was cut off.
+        # New lines must not be appended to a truncated one.
         self._write_all = not data.endswith(b"\n")
         read = []
         for line in data.split(b"\n"):
@@ -257,7 +257,7 @@ class EventLog:
                     if not self._condition.wait(TOUCH_EVERY_S):
                         self._touch()
                 if failed_at is not None and not self._closing:
-                    # Everything waits for the disk; what comes meanwhile is written with the rest.
+                    # Everything waits for the disk; events that come meanwhile are written with the rest.
                     self._condition.wait_for(lambda: self._closing, self._retry_s)
                 closing = self._closing
                 whole = self._write_all or failed_at is not None
@@ -311,20 +311,20 @@ class EventLog:
 
 
 def _in_order(events: list[FleetEvent]) -> list[FleetEvent]:
-    """Return as many of these as can be in ascending order of their numbers: one wrong number costs one event.
+    """Return as many of these as are in ascending order of their numbers: one wrong number costs one event.
 
-    By patience sorting (longest increasing subsequence).
+    Found by patience sorting (longest increasing subsequence).
     """
     ends: list[int] = []
-    """The least number that such a sequence of each length ends with."""
+    """The least number that ends such a sequence, for each length."""
     at: list[int] = []
-    """Where in `events` that one is."""
+    """The index of that event in `events`."""
     before: list[int | None] = []
     for index, event in enumerate(events):
         length = bisect_left(ends, event.number)
         before.append(at[length - 1] if length else None)
         if ends[length : length + 1] == [event.number]:
-            # Of two with one number the first stays.
+            # Of two events with the same number the first stays.
             continue
         ends[length : length + 1] = [event.number]
         at[length : length + 1] = [index]

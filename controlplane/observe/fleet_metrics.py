@@ -1,8 +1,8 @@
-"""What the control plane knows of each member, for Prometheus: robots behind a NAT cannot be scraped themselves.
+"""Exports to Prometheus what the control plane knows of each member: robots behind a NAT cannot be scraped themselves.
 
-A scrape asks the loop for what it knows; the loop gathers that in short turns, by reference, and the scrape's own
-thread writes it down, one series at a time: tens of thousands of objects at once would set off the collector of
-garbage, for which all threads wait. The series are bounded, and each robot has its share of them.
+A scrape asks the loop, which gathers references in short turns. The scrape's own thread then makes the series one at a
+time: tens of thousands of objects at once would start the garbage collector, for which all threads wait. The series
+are bounded, and each robot has its share of them.
 """
 
 from __future__ import annotations
@@ -31,19 +31,19 @@ if TYPE_CHECKING:
     from protos.model.ids import NodeName
 
 MAX_SERIES = 100_000
-"""Of all members."""
+"""Most series of all members."""
 
 SERIES_OF_MEMBER = 6
-"""Of each at most, there or gone, beside a robot's own and a server's by service: a server's."""
+"""Most series of a member, present or gone, besides a robot's own and a server's by service: a server has this many."""
 
 MAX_SERIES_OF_SERVICES = 20_000
-"""Of all servers by service, two for each; they have equal shares of it."""
+"""Series of all servers by service, two for each service; servers have equal shares."""
 
 MAX_GONE = 1024
-"""Members that are gone and still have series, those that went last."""
+"""Departed members that still have series, the last to go."""
 
 REUSED_S = 1.0
-"""Scrapes within this time share their values."""
+"""Scrapes within this interval share their values."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,7 +53,7 @@ class Fleet:
     members: Sequence[MemberView]
     gone: Sequence[DepartedSidecar]
     certificates_end: Mapping[NodeName, float]
-    """Seconds since 1970."""
+    """Expiry of certificates, in seconds since 1970."""
     now: float
     """The moment in the members' monotonic seconds ..."""
     now_wall: float
@@ -79,7 +79,7 @@ Rows = Callable[[], Iterator[tuple[Labels, float]]]
 
 
 class _Series:
-    """The samples of a metric, made while they are read."""
+    """The samples of a metric, made lazily as they are read."""
 
     def __init__(self, name: str, labels: Labels, rows: Rows) -> None:
         self._name = name
@@ -92,7 +92,7 @@ class _Series:
 
 
 class FleetCollector:
-    """Collects on the thread of a scrape; `ask` gets the fleet from the loop, and may raise TimeoutError."""
+    """Collects metrics on the thread of a scrape; `ask` gets the fleet from the loop, and may raise TimeoutError."""
 
     def __init__(self, ask: Callable[[], Fleet]) -> None:
         self._ask = ask
@@ -101,14 +101,14 @@ class FleetCollector:
         self._at = -math.inf
 
     def collect(self) -> Iterable[Metric]:
-        """All metrics of all members."""
+        """Return all metrics of all members."""
         with self._lock:
             if time.monotonic() - self._at >= REUSED_S:
                 self._fleet = None
                 try:
                     self._fleet = self._ask()
                 except TimeoutError:
-                    # It stops, or is hopelessly busy: no values are better than old ones that look new.
+                    # The loop stops, or is hopelessly busy: no values are better than old ones that look new.
                     return ()
                 self._at = time.monotonic()
             fleet = self._fleet
@@ -116,7 +116,7 @@ class FleetCollector:
 
 
 def families(fleet: Fleet) -> Iterable[Metric]:
-    """Write everything down, while it is read."""
+    """Return all metrics, whose samples are made as they are read."""
     fleet = replace(fleet, gone=fleet.gone[:MAX_GONE])
     robots = [member for member in fleet.members if member.role is Role.ROBOT]
     services = _services(fleet)
@@ -129,14 +129,14 @@ def families(fleet: Fleet) -> Iterable[Metric]:
 
 
 def _services(fleet: Fleet) -> list[tuple[NodeName, Sequence[ServedView], int]]:
-    """Each server's services that have series, and how many more there are."""
+    """Return the services of each server that have series, and how many more there are."""
     servers = [member for member in fleet.members if member.role is Role.CLOUD]
     most = MAX_SERIES_OF_SERVICES // 2 // max(1, len(servers))
     return [(server.name, server.served[:most], len(server.served[most:])) for server in servers]
 
 
 def _room(robot: MemberView, share: int) -> _Room:
-    """Share it out, to what is needed most first."""
+    """Divide a robot's share among the kinds of series, the most needed first."""
     wanted = (
         len(robot.paths_of_services),
         2 * len(robot.misses),
@@ -176,13 +176,13 @@ def _counter(name: str, text: str, labels: Labels, rows: Rows) -> Metric:
 
 
 def _lazy(family: Metric, name: str, labels: Labels, rows: Rows) -> Metric:
-    # Whoever reads a metric goes over its samples once.
+    # A reader iterates over the samples of a metric once.
     family.samples = cast("list[Sample]", _Series(name, labels, rows))
     return family
 
 
 def _members(fleet: Fleet) -> Iterator[Metric]:
-    # Who is cut off by the policy is as good as gone, and there.
+    # A member cut off by the policy counts as gone, and is still there.
     there = {member.name for member in fleet.members}
     gone = [one for one in fleet.gone if one.name not in there]
 
@@ -220,13 +220,13 @@ def _servers(fleet: Fleet) -> Metric:
         doubted: Counter[NodeName] = Counter()
         for robot in fleet.members:
             reaches = {path.server for path in robot.paths if path.up}
-            # Who reaches nobody has a trouble of its own.
+            # A robot that reaches no server has a problem of its own.
             if reaches:
                 counts.update((server, "up") for server in reaches)
                 counts.update((server, "never") for server in robot.unproven)
                 doubted.update(robot.doubted)
                 counts.update((server, "lost") for server in robot.lost)
-        # That one says that it did proves nothing against two.
+        # One robot that has reached a server proves nothing against two that doubt it.
         counts.update({(server, "never"): count for server, count in doubted.items() if count > 1})
         for member in fleet.members:
             if member.role is Role.CLOUD:

@@ -1,8 +1,8 @@
-"""Prometheus metrics of the control plane (contract names in the architecture page).
+"""Exports the Prometheus metrics of the control plane (contract names in the architecture page).
 
 The exporter serves from a thread of its own: the loop leaves finished values for it, and it never looks into the
-core. The registry is our own, without the interpreter's collectors and `_created` series, which are no base units
-and which `promtool check metrics` complains of; those of the process tell of its memory, and when it was started.
+core. The registry is our own, without the interpreter's collectors and `_created` series, which have no base units
+and which `promtool check metrics` reports. The process collector shows its memory and start time.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from protos.trust.identity import Identity, RevocationList
 
 SOLVE_BUCKETS_S = (0.001, 0.003, 0.01, 0.03, 0.1, 0.3, 1.0, 3.0, 10.0)
-"""A robot alone takes milliseconds, a hundred a quarter of a second, a thousand some seconds."""
+"""Buckets of the solving time: one robot takes milliseconds, a hundred a quarter of a second, a thousand seconds."""
 
 
 NO_EVENTS = EventLogState()
@@ -66,7 +66,7 @@ REFUSAL_REASONS = (
     stream_limits.TOO_MANY_STREAMS,
     stream_limits.TOO_FAST,
 )
-"""Labels of plr_refused_connections_total, there from the start."""
+"""Labels of plr_refused_connections_total, present from the start."""
 
 
 class _Values:
@@ -113,7 +113,7 @@ class Metrics:
             self._refused_connections.labels(reason)
         self._own: tuple[Identity, Mapping[int, RevocationList | None]] | None = None
         self.files_refused = False
-        """Whether the TLS files on the disk are not taken."""
+        """Whether the TLS files on disk are refused."""
         self.policy_reloads = prometheus_client.Counter(
             "plr_policy_reloads_total",
             "Times the access policy was read again, by what came of it.",
@@ -124,19 +124,19 @@ class Metrics:
         prometheus_client.ProcessCollector(registry=self.registry)
 
     def refused_connection(self, reason: str) -> None:
-        """A connection or call was refused or ended; `reason` is one of REFUSAL_REASONS."""
+        """Count a refused or ended connection or call; `reason` is one of REFUSAL_REASONS."""
         self._refused_connections.labels(reason).inc()
 
     def own_certificate(self, identity: Identity, lists: Mapping[int, RevocationList | None]) -> None:
-        """These are the certificate and the revocation lists (`Trust.lists`) in use from now on."""
+        """Show this certificate and these revocation lists (`Trust.lists`) as in use from now on."""
         self._own = identity, lists
 
     def watch_fleet(self, ask: Callable[[], Fleet]) -> None:
-        """Tell of each member too: `ask` gets them, on a thread other than the loop's."""
+        """Export each member too; `ask` gets them, on a thread other than the loop's."""
         self.registry.register(FleetCollector(ask))
 
     def start(self, host: str, port: int) -> tuple[str, int]:
-        """Serve them over HTTP; returns where."""
+        """Serve the metrics over HTTP and return the address."""
         return host, MetricsServer(host, port, self.registry).port
 
     def update(
@@ -147,7 +147,7 @@ class Metrics:
         events: EventLogState = NO_EVENTS,
         dropped: Mapping[str, int] = NOTHING_DROPPED,
     ) -> None:
-        """Take the values of this moment."""
+        """Take the current values."""
         self._values.families = (
             *_members(core),
             *_sync(core),
@@ -207,7 +207,7 @@ def _sync(core: ControlCore) -> Iterable[Metric]:
     states: Counter[tuple[str, ...]] = Counter(
         {(kind.value, state.name.lower()): 0 for kind in ResourceKind for state in SyncState}
     )
-    # Counted by what they are, and named then: thousands of names are made in milliseconds, six in none.
+    # Count first and name the few results afterwards: naming thousands of states takes milliseconds.
     for (kind, state), count in Counter((kind, state) for _, kind, state in core.sync_states()).items():
         states[kind.value, state.name.lower()] += count
     yield _gauge("plr_resource_sync", "Sidecars by how far they follow what was pushed.", ["resource", "state"], states)
@@ -335,7 +335,7 @@ def _certificate(
 
 
 def _loop() -> Metric:
-    """Called on the loop's thread."""
+    """Return the processor time of the loop; must run on the loop's thread."""
     text = "Processor time of the thread that serves all streams: it can have one core."
     return _counter("plr_loop_cpu_seconds_total", text, [], {(): time.thread_time()})
 

@@ -1,4 +1,4 @@
-"""What the log of events tells a new run of the control plane: who was gone, and who was there when it ended."""
+"""Reads from the event log which members were gone, and which were present when the previous run ended."""
 
 from __future__ import annotations
 
@@ -16,22 +16,22 @@ if TYPE_CHECKING:
 def departures(
     events: Sequence[FleetEvent], *, ran_until: float | None, now_wall: float, now: float
 ) -> tuple[list[Departure], list[Departure]]:
-    """Who was gone, who went first first; and who was there, as a departure to be noted if it does not come back.
+    """Return the departures so far, the earliest first, and one for each member that was present, should it not return.
 
-    `ran_until` is when the run before ended, `now_wall` is now, both in seconds since 1970; `now` is the same moment in
-    the monotonic seconds of what is returned.
+    `ran_until` is when the previous run ended and `now_wall` is now, both in seconds since 1970. `now` is the same
+    moment in monotonic seconds, as used in the result.
     """
     gone: dict[NodeName, FleetEvent] = {}
     present: dict[NodeName, FleetEvent] = {}
     for event in events:
         node = event.node
-        # Who is refused was not there for that.
+        # A refused member was not present.
         if node is None or event.role is None or event.kind is EventKind.REFUSED:
             continue
         gone.pop(node, None)
         present.pop(node, None)
         (gone if event.kind is EventKind.DEPARTED else present)[node] = event
-    # Had it fallen silent before the end of that run, the log would tell.
+    # A member present in the log was heard from until that run ended; otherwise its departure would be logged.
     ended_at = now_wall if ran_until is None else ran_until
 
     def departure(event: FleetEvent, at_wall: float, seen_wall: float) -> Departure:
