@@ -1,4 +1,4 @@
-"""Messages through the two directions of a recorded path: first in, first out, at the recorded rate."""
+"""Sends messages through the two directions of a recorded path: first in, first out, at the recorded rate."""
 
 from __future__ import annotations
 
@@ -12,21 +12,21 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
 PACKET_BYTES = 1400
-"""What one packet carries of a message."""
+"""Payload of one packet."""
 
 _BYTES_PER_KBIT = 125.0
 
 
 class Direction(Protocol):
-    """What one direction of a path does in one step: `controlplane.planning.traces.Direction`, or a link of the lab."""
+    """One direction of a path during one step: `controlplane.planning.traces.Direction`, or a link of the lab."""
 
     @property
     def rate_kbps(self) -> float | None:
-        """Kilobit/s; 0 is an outage, as is None: a recorded path has a rate."""
+        """Rate in kilobit/s; 0 is an outage, and so is None, since a recorded path has a rate."""
 
     @property
     def delay_ms(self) -> float:
-        """Propagation, one way."""
+        """One-way propagation delay in milliseconds."""
 
     @property
     def loss(self) -> float:
@@ -34,11 +34,11 @@ class Direction(Protocol):
 
     @property
     def queue_bytes(self) -> int:
-        """Room in front of the bottleneck."""
+        """Size in bytes of the queue in front of the bottleneck."""
 
 
 class Step(Protocol):
-    """From `at_s` seconds on, both directions are like this."""
+    """The state of both directions from `at_s` seconds on."""
 
     @property
     def at_s(self) -> float:
@@ -46,15 +46,15 @@ class Step(Protocol):
 
     @property
     def up(self) -> Direction:
-        """From the robot."""
+        """Direction from the robot."""
 
     @property
     def down(self) -> Direction:
-        """To the robot."""
+        """Direction to the robot."""
 
 
 class FifoLink:
-    """One direction. Messages are offered in order of time; times are seconds of the trace's clock."""
+    """One direction of a path. Messages must be sent in order of time; times are seconds of the trace's clock."""
 
     def __init__(self, steps: Sequence[Step], *, up: bool) -> None:
         profiles = [step.up if up else step.down for step in steps]
@@ -68,19 +68,19 @@ class FifoLink:
         for rate, (start, end) in zip(self._rates, pairwise(self._starts), strict=False):
             self._capacity.append(self._capacity[-1] + rate * (end - start))
         self._work = 0.0
-        """Capacity used up when all that was accepted has left."""
+        """Capacity used up once all accepted messages have left."""
         self._last_arrival = 0.0
 
     def _step(self, at: float) -> int:
         return max(0, bisect_right(self._starts, at) - 1)
 
     def capacity_by(self, at: float) -> float:
-        """Bytes that could have left by then, since the trace's start."""
+        """Return the bytes that could have left between the trace's start and `at`."""
         step = self._step(at)
         return self._capacity[step] + self._rates[step] * (at - self._starts[step])
 
     def time_of(self, capacity: float) -> float:
-        """When so many bytes could have left; inf if the trace ends before."""
+        """Return when `capacity` bytes could have left; inf if the trace ends before."""
         step = bisect_left(self._capacity, capacity) - 1
         if step < 0:
             return 0.0
@@ -88,14 +88,14 @@ class FifoLink:
         return self._starts[step] + (capacity - self._capacity[step]) / rate if rate else math.inf
 
     def delay_at(self, at: float) -> float:
-        """Seconds of propagation of what leaves then."""
+        """Return the propagation delay in seconds of a packet that leaves `at` that time."""
         return self._delays[self._step(at)]
 
     def send(self, at: float, size: int, rng: random.Random) -> float:
-        """When a message of `size` bytes offered `at` has arrived; inf when the queue has no room for it.
+        """Return when a message of `size` bytes sent `at` has arrived; inf if it is lost or the queue has no room.
 
-        Each packet is lost with the step's probability. What is lost is sent once more, a round trip after it was
-        missed; lost again, the message is lost.
+        Each packet is lost with the step's probability. A lost packet is sent once more, a round trip after it left. If
+        it is lost again, the message is lost.
         """
         used = max(self._work, self.capacity_by(at))
         if used - self.capacity_by(at) + size > self._queue_bytes:
@@ -129,9 +129,9 @@ class FifoPath:
         self.down = FifoLink(steps, up=False)
 
     def request(self, at: float, size: int, answer_size: int, processing_s: float, rng: random.Random) -> float:
-        """Seconds from `at` to the answer; inf when request or answer is lost.
+        """Return the seconds from `at` to the answer; inf if request or answer is lost.
 
-        Answers queue in the order of their requests, though a server may overtake itself by its processing time.
+        Answers queue in the order of their requests, even if a server with varying processing time would reorder them.
         """
         arrived = self.up.send(at, size, rng)
         if math.isinf(arrived):

@@ -1,4 +1,4 @@
-"""The predictions as a table for a terminal, and what they say of the target."""
+"""Formats the predictions as a table for a terminal, with a verdict on the target."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ HEADER = ("INTERFACES", "SERVERS", "PRODUCT", "JOINT", "JOINT/PRODUCT", "BEST SE
 
 
 def render(source: Source, prospects: Sequence[Prospect], deadline_s: float, target: float | None) -> str:
-    """What was recorded, a row for each set, and the verdict."""
+    """Return what was recorded, a row for each set, and the verdict."""
     rows = [
         (
             str(found.interfaces),
@@ -37,7 +37,7 @@ def render(source: Source, prospects: Sequence[Prospect], deadline_s: float, tar
 
 
 def verdict(source: Source, prospects: Sequence[Prospect], target: float) -> Iterator[str]:
-    """The least set that meets the target; without one, by how much the best fails and what would do."""
+    """Yield the smallest set that meets the target; if there is none, by how much the best fails and what would do."""
     least = least_set(prospects, target)
     if least is not None:
         yield (

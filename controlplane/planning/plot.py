@@ -1,4 +1,4 @@
-"""The predictions over the deadline, drawn: SVG (or what else matplotlib writes), or one HTML page with the table."""
+"""Plots the predictions over the deadline: SVG (or another format of matplotlib), or one HTML page with the table."""
 
 from __future__ import annotations
 
@@ -15,19 +15,19 @@ if TYPE_CHECKING:
     from controlplane.planning.prospects import Prospect, Source
 
 SPAN = 8.0
-"""Deadlines are drawn from a part of the one asked for to so many times it."""
+"""Ratio of the axis limits to the given deadline: deadlines from 1/SPAN of it to SPAN times it are drawn."""
 
 POINTS = 41
 
 
 class PlotError(Exception):
-    """It can not be drawn, or not be written; the text says why in one line."""
+    """The plot cannot be drawn or written; the text says why in one line."""
 
 
 def draw(file: Path, source: Source, deadline_s: float, target: float | None) -> None:
     """Draw each set's miss probability over the deadline into `file`, by its suffix. Raises PlotError."""
     try:
-        # Planning is for an operator's desk: the control plane itself does without it.
+        # Planning runs at an operator's desk: the control plane itself does not need matplotlib.
         from matplotlib.figure import Figure
     except ImportError:
         raise PlotError("--plot needs matplotlib: pip install matplotlib") from None

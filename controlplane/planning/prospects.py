@@ -1,9 +1,9 @@
-"""What sets of interfaces and servers would give, and the least of them that is good enough.
+"""Describes what sets of interfaces and servers would achieve, and finds the smallest that suffices.
 
 This is the paper's LSC theorem turned into a tool. On commodity infrastructure one path misses a deadline with some
-probability epsilon > 0 that nobody can remove; copies over k paths that fail independently all miss with epsilon^k, so
-every target above 0 is met by finitely many. How independent paths really are decides how many: `joint` says what was
-measured, `product` what independence would give.
+probability epsilon > 0 that nobody can remove. Copies over k paths that fail independently all miss with epsilon^k, so
+finitely many paths meet every target above 0. How many depends on how independent the paths really are: `joint` is the
+measured probability, `product` the one under independence.
 """
 
 from __future__ import annotations
@@ -18,42 +18,42 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class Prospect:
-    """Every request goes over `interfaces` interfaces, each copy to one of `servers` servers."""
+    """A set of paths: every request goes over `interfaces` interfaces, each copy to one of `servers` servers."""
 
     interfaces: int
     servers: int
     paths: str
-    """Which, in words."""
+    """The paths in words."""
     product: float
     """Predicted miss probability if paths fail independently."""
     joint: float
-    """The same as measured."""
+    """The miss probability as measured."""
 
 
 class Source(Protocol):
-    """What was recorded."""
+    """A recording that predictions can be made from."""
 
     @property
     def title(self) -> str:
-        """What the predictions rest on, in one line."""
+        """The basis of the predictions, in one line."""
 
     @property
     def requests(self) -> float:
-        """Requests recorded for one set of paths: rarer misses than one in so many are a guess."""
+        """Requests recorded for one set of paths; misses rarer than one in this many are a guess."""
 
     def prospects(self, deadline_s: float) -> list[Prospect]:
-        """For each number of interfaces and servers the best set, the smallest first."""
+        """Return the best set for each number of interfaces and servers, the smallest first."""
 
 
 def least_set(prospects: Sequence[Prospect], target: float) -> Prospect | None:
-    """The set with the fewest interfaces and, among those, servers whose predicted miss probability is at most
-    `target`; None if there is none."""
+    """Return the set with the fewest interfaces and, among those, the fewest servers that is predicted to miss with at
+    most probability `target`; None if there is none."""
     enough = [prospect for prospect in prospects if prospect.joint <= target]
     return min(enough, key=lambda found: (found.interfaces, found.servers, found.joint), default=None)
 
 
 def paths_needed(epsilon: float, target: float) -> int | None:
-    """How many paths that miss with `epsilon` each, independently, all miss with at most `target`; None: no number.
+    """Return how many independent paths that miss with `epsilon` each meet `target` together; None if no number does.
 
     k >= log(target) / log(epsilon), for 0 < target < 1 (docs/develop/theory.md).
     """
@@ -61,5 +61,5 @@ def paths_needed(epsilon: float, target: float) -> int | None:
         return None
     if epsilon <= target:
         return 1
-    # Rounding must not ask for one path more where a power of epsilon is the target itself.
+    # Rounding must not add a path where a power of epsilon equals the target.
     return math.ceil(math.log(target) / math.log(epsilon) - 1e-9)

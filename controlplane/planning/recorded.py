@@ -1,4 +1,4 @@
-"""What a running control plane had measured of one robot's service: the answer of `plr explain --json`."""
+"""Predicts from what a running control plane measured of one robot's service: the answer of `plr explain --json`."""
 
 from __future__ import annotations
 
@@ -33,25 +33,25 @@ if TYPE_CHECKING:
     from protos.model.mapping import Assignment
 
 MAX_CHOICES = 20_000
-"""Sets looked at: beyond, only the servers with the least epsilon of each interface are."""
+"""Most sets examined; if there are more, only the servers with the least epsilon of each interface are used."""
 
 MAX_PROBES = 100.0
-"""Probes beyond which more of them do not bring a probability any nearer to 0 or 1: they are small."""
+"""Beyond this many, probes no longer move a probability closer to 0 or 1: they are small."""
 
 MIN_REQUESTS = 20.0
-"""Requests a pair must have carried before it tells how much slower requests are than probes."""
+"""Requests that a pair must have carried before it shows how much slower requests are than probes."""
 
 
 MAX_RECORDING_BYTES = 64 << 20
-"""An answer takes some MB at most: 16 interfaces, 4,096 servers."""
+"""Longest recording: an answer takes some MB at most (16 interfaces, 4,096 servers)."""
 
 
 class RecordingError(ValueError):
-    """Not a recording; the text names the file."""
+    """The file is not a recording; the text names the file."""
 
 
 def read_recording(file: Path) -> Explanation:
-    """Read what `plr explain --json` printed. Raises RecordingError."""
+    """Read what `plr explain --json` printed; raises RecordingError."""
     try:
         answer = json_format.Parse(_text(file), admin_pb2.ExplainResponse())
         return explanation_from_proto(answer)
@@ -69,7 +69,7 @@ def _text(file: Path) -> str:
 
 
 class RecordedService:
-    """One robot's service, at any deadline: latencies are those of the requests as they were."""
+    """One robot's service, at any deadline, with the latencies of the requests as they were sent."""
 
     def __init__(self, explanation: Explanation) -> None:
         self._explanation = explanation
@@ -87,7 +87,7 @@ class RecordedService:
         return self._explanation.deadline_s
 
     def prospects(self, deadline_s: float) -> list[Prospect]:
-        """For each number of interfaces and servers the best set of those recorded."""
+        """Return the best recorded set for each number of interfaces and servers."""
         if not self._pairs:
             return []
         block = self._block(deadline_s)
@@ -144,7 +144,7 @@ class RecordedService:
         return (over * samples + IGNORANCE.misses) / (samples + IGNORANCE.weight)
 
     def _network(self, pair: PairExplanation) -> tuple[Distribution, float]:
-        """What the network takes, and what to add to it: of a pair that carried no request by its round trips."""
+        """Return the network latency and what to add to it; a pair without requests is judged by its round trips."""
         of_requests = _distribution(pair.network)
         if of_requests is not None:
             return of_requests, 0.0
@@ -156,9 +156,9 @@ class RecordedService:
     def _lifts_between_interfaces(
         self, index: Mapping[Assignment, PathIndex], epsilon: Sequence[Sequence[float | None]]
     ) -> Iterator[tuple[tuple[PathIndex, PathIndex], float]]:
-        """How much more often than by chance two paths miss together because their interfaces do, whatever the servers.
+        """Yield how much more often than by chance two paths miss together because their interfaces do.
 
-        Never so much that both would miss more often than the better one alone.
+        This holds whatever the servers. The factor is capped: both never miss more often than the better path alone.
         """
         for joint in self._explanation.joints:
             for (first, one), (second, other) in itertools.product(index.items(), repeat=2):
@@ -171,9 +171,10 @@ class RecordedService:
     def _lifts_through_servers(
         self, index: Mapping[Assignment, PathIndex], deadline_s: float
     ) -> dict[tuple[PathIndex, PathIndex], float]:
-        """How much more often than by chance two paths to one server miss together because it runs a request once.
+        """Return how much more often than by chance two paths to one server miss together, as it runs a request once.
 
-        P(both miss) is the mean, over what the server takes, of the product of what is left to miss over either.
+        P(both miss) is the mean, over the server's computing time, of the product of the two probabilities that the
+        network exceeds the remaining time.
         """
         lifts = {}
         for first, second in itertools.combinations(self._pairs.values(), 2):
@@ -192,7 +193,7 @@ class RecordedService:
 
 
 def _overhead(pairs: Collection[PairExplanation]) -> float:
-    """How much slower, in seconds, the network is with requests than with probes, in the median."""
+    """Return how many seconds slower the network is, in the median, for requests than for probes."""
     found = [
         (pair.network.total, pair.network.quantile(0.5) - pair.rtt.quantile(0.5))
         for pair in pairs
@@ -204,13 +205,13 @@ def _overhead(pairs: Collection[PairExplanation]) -> float:
 
 
 def _distribution(histogram: Histogram) -> Distribution | None:
-    """None of an empty one."""
+    """Return the histogram's distribution; None if it is empty."""
     total = histogram.total
     return Distribution.of(histogram.counts / total, histogram.lost / total) if total else None
 
 
 def _choices(block: Block) -> NDArray[np.intp]:
-    """Every way to give each interface a server or none, a row each with -1 for none."""
+    """Return every way to give each interface a server or none, one row each, with -1 for none."""
     share = max(1, int(MAX_CHOICES ** (1.0 / len(block.interfaces))) - 1)
     options = []
     for row in block.epsilon:

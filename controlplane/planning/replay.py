@@ -1,4 +1,4 @@
-"""Requests sent through recorded paths: what one interface, or both, and one server, or two, would have given."""
+"""Sends requests through recorded paths, as if over one interface or both, and to one server or two."""
 
 from __future__ import annotations
 
@@ -31,27 +31,27 @@ class Replayed:
     """Seconds until the first answer of each request, inf if none came."""
 
     alone: tuple[Latencies, Latencies]
-    """Over each path by itself."""
+    """Latencies over each path by itself."""
     one_server: Latencies
-    """Over both, to one server, which runs each request once."""
+    """Latencies over both paths to one server, which runs each request once."""
     two_servers: Latencies
-    """Over both, each to a server of its own."""
+    """Latencies over both paths, each to a server of its own."""
 
 
 def replay(trace: RecordedPaths, workload: Workload) -> Replayed:
-    """Send the workload from the trace's start to its end; the same every time.
+    """Send the workload from the trace's start to its end; the result is the same every time.
 
-    Nothing is called off when the first answer is there, so queues are no shorter than they would be.
+    No copy is cancelled when the first answer arrives, so queues are no shorter than they would be.
     """
     rng = random.Random(zlib.crc32(trace.name.encode()))  # noqa: S311 - no secret depends on it
     paths = [FifoPath(trace.paths[name]) for name in PATHS]
-    # What one server answers goes down in another order.
+    # Answers of a single server go down in another order.
     shared = [FifoPath(trace.paths[name]).down for name in PATHS]
     alone: tuple[list[float], list[float]] = ([], [])
     one_server: list[float] = []
     interval = 1.0 / workload.rate_hz
     for number in range(int(trace.duration_s * workload.rate_hz)):
-        # Not in step with the trace, whose rows change at whole seconds.
+        # Avoid sending in step with the trace, whose rows change at whole seconds.
         at = (number + rng.random()) * interval
         computes = [workload.compute.draw(rng) for _ in PATHS]
         arrivals = [path.up.send(at, workload.request_bytes, rng) for path in paths]
@@ -75,7 +75,7 @@ def replay(trace: RecordedPaths, workload: Workload) -> Replayed:
 
 
 class ReplayedTraces:
-    """Several traces, pooled: as if the robot had gone through one after the other."""
+    """Several traces, pooled as if the robot had driven through one after the other."""
 
     def __init__(self, traces: Sequence[RecordedPaths], workload: Workload) -> None:
         replayed = [replay(trace, workload) for trace in traces]
@@ -91,7 +91,7 @@ class ReplayedTraces:
         )
 
     def prospects(self, deadline_s: float) -> list[Prospect]:
-        """One interface, both to one server, both to two."""
+        """Return one interface, both to one server, and both to two."""
         singles = [_share_over(latencies, deadline_s) for latencies in self._alone]
         best = min(singles)
         product = math.prod(singles)
@@ -104,6 +104,6 @@ class ReplayedTraces:
 
 
 def _share_over(latencies: Latencies, deadline_s: float) -> float:
-    """The expected share of requests that miss; none seen does not make it 0."""
+    """Return the expected share of requests that miss; it is above 0 even if none was seen to miss."""
     missed = float(np.count_nonzero(latencies > deadline_s))
     return (missed + IGNORANCE.misses) / (len(latencies) + IGNORANCE.weight)

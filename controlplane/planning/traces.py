@@ -1,4 +1,4 @@
-"""Two-path traces: a step-wise record of rate, round-trip time and loss of paths `a` and `b`, one clock.
+"""Reads two-path traces: step-wise records of rate, round-trip time and loss of paths `a` and `b` on one clock.
 
 A trace file is CSV, gzip-compressed if its name ends in .gz, with a header and one row per step:
 
@@ -31,20 +31,20 @@ COLUMNS = (
 PATHS = ("a", "b")
 
 MAX_TRACE_BYTES = 64 << 20
-"""Of one trace, unpacked: a day of steps 0.1 s apart."""
+"""Longest trace, unpacked: a day of steps 0.1 s apart."""
 
 DEFAULT_QUEUE_BYTES = 1_200_000
-"""What a cellular base station or a Wi-Fi driver commonly holds back for one station."""
+"""What a cellular base station or a Wi-Fi driver commonly buffers for one station."""
 
 
 class TraceError(ValueError):
-    """Not a trace; the text names file or trace, and the line."""
+    """The text is not a trace; the message names file or trace, and the line."""
 
 
 @dataclass(frozen=True, slots=True)
 class Direction:
-    """One direction of a path. Packets are lost with probability `loss`; of those left, `rate_kbps` (kilobit/s of IP
-    packets) leave a first-in-first-out queue of `queue_bytes`, and arrive after `delay_ms` of propagation."""
+    """One direction of a path. Packets are lost with probability `loss`. The others leave a first-in-first-out queue of
+    `queue_bytes` at `rate_kbps` (kilobit/s of IP packets), and arrive after `delay_ms` of propagation."""
 
     rate_kbps: float
     delay_ms: float
@@ -54,7 +54,7 @@ class Direction:
 
 @dataclass(frozen=True, slots=True)
 class PathStep:
-    """From `at_s` (seconds from the trace's start) on, the path is like this."""
+    """The state of the path from `at_s` on, in seconds from the trace's start."""
 
     at_s: float
     up: Direction
@@ -70,7 +70,7 @@ class RecordedPaths:
 
     @property
     def duration_s(self) -> float:
-        """When the last step begins, plus the length of the step before it."""
+        """Start of the last step, plus the length of the step before it."""
         times = [step.at_s for step in next(iter(self.paths.values()))]
         return times[-1] + (times[-1] - times[-2] if len(times) > 1 else 1.0)
 
@@ -121,8 +121,8 @@ def parse_trace(text: str, *, name: str = "trace", queue_bytes: int = DEFAULT_QU
 
 
 def _numbers(row: dict[str, str]) -> dict[str, float]:
-    """Check one row. Rates and times are not negative, losses are probabilities."""
-    # The reader puts what is too much under None, and None where something is missing.
+    """Check one row and return its numbers. Rates and times are not negative, losses are probabilities."""
+    # The reader puts surplus fields under the key None, and None where a field is missing.
     if set(row) != set(COLUMNS) or None in row.values():
         raise ValueError(f"expected {len(COLUMNS)} numbers")
     values = {column: float(row[column]) for column in COLUMNS}

@@ -1,4 +1,4 @@
-"""What is sent through traces."""
+"""Describes the requests that are sent through traces."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ _P99 = NormalDist().inv_cdf(0.99)
 
 @dataclass(frozen=True, slots=True)
 class Compute:
-    """How long a server works on a request: log-normal, by its median and its 99th percentile, in seconds."""
+    """Computing time of a request: log-normal, given by its median and 99th percentile, in seconds."""
 
     median_s: float
     p99_s: float
 
     def draw(self, rng: random.Random) -> float:
-        """One request's time."""
+        """Draw the computing time of one request."""
         return self.median_s * rng.lognormvariate(0.0, math.log(self.p99_s / self.median_s) / _P99)
 
 
@@ -36,4 +36,4 @@ class Workload:
 
 
 DEFAULT = Workload(request_bytes=10_000, answer_bytes=1000, rate_hz=10.0, compute=Compute(0.02, 0.04))
-"""Unless said otherwise; what was recorded live has its own."""
+"""Used unless options say otherwise; a live recording has its own workload."""
