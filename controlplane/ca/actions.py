@@ -1,6 +1,6 @@
-"""What the commands of `plr ca` do; they raise AuthorityError, ConfigError or OSError, and return what to print of it.
+"""Carries out the commands of `plr ca`; they raise AuthorityError, ConfigError or OSError, and return text to print.
 
-What is returned is done, whether or not it can be printed.
+Once a command returns, its work is done, whether or not the text can be printed.
 """
 
 from __future__ import annotations
@@ -85,7 +85,7 @@ def renew(arguments: argparse.Namespace) -> str:
 
 
 def revoke(arguments: argparse.Namespace) -> str:
-    """Revoke what a node has."""
+    """Revoke a node's certificates."""
     folder = opened(arguments)
     with folder.locked() as authority:
         revoked = authority.revoke(arguments.name, x509.ReasonFlags(arguments.reason))
@@ -104,7 +104,7 @@ def publish(arguments: argparse.Namespace) -> str:
 
 
 def show(arguments: argparse.Namespace) -> str:
-    """Print what was issued."""
+    """List what was issued."""
     folder = AuthorityFolder(arguments.dir)
     records = folder.records()
     return listing.render(records, [folder.certificate(record) for record in records], time.time())
@@ -130,7 +130,7 @@ def retire(arguments: argparse.Namespace) -> str:
 
 
 def change_passphrase(arguments: argparse.Namespace) -> str:
-    """Encrypt the CA's key with another passphrase, in the way of today."""
+    """Encrypt the CA's key with another passphrase, by the current method."""
     folder = opened(arguments, warn=False)
     source = PassphraseSource("new passphrase", "--new-passphrase-file", NEW_VARIABLE, arguments.new_passphrase_file)
     new = None if arguments.no_passphrase else source.choose()
@@ -140,9 +140,9 @@ def change_passphrase(arguments: argparse.Namespace) -> str:
 
 
 def opened(arguments: argparse.Namespace, *, warn: bool = True) -> AuthorityFolder:
-    """Return the CA's folder with the passphrase of its keys, asked for if they have one; raises ConfigError.
+    """Return the CA's folder with the passphrase of its keys, if they have one; raises ConfigError.
 
-    Whoever is asked for it is asked before the folder is locked.
+    If the user must be asked for it, that happens before the folder is locked.
     """
     folder = AuthorityFolder(arguments.dir)
     protections = folder.protections()
@@ -171,7 +171,7 @@ def _mend(arguments: argparse.Namespace) -> str:
 
 
 def save(folder: AuthorityFolder, authority: Authority) -> None:
-    """Keep the CA as it is now, and warn of nodes' folders that could not be brought up to date; raises OSError."""
+    """Save the CA, and warn of nodes' folders that could not be updated; raises OSError."""
     for problem in folder.save(authority):
         _warn(problem)
 
@@ -180,7 +180,7 @@ def refuse_taken(out: Path, name: str, *, own: bool) -> None:
     """Raise AuthorityError if the folder holds the key or the certificate of a node with another name, or OSError as
     `refuse_planted` does.
 
-    `own`: it is the CA's folder for this name, where a key without certificate is left of a command cut short.
+    `own` marks the CA's own folder for this name, where an interrupted command may leave a key without a certificate.
     """
     if out.exists():
         refuse_planted(out)
@@ -188,7 +188,7 @@ def refuse_taken(out: Path, name: str, *, own: bool) -> None:
     if not path.exists() and (own or not (out / KEY_FILE).exists()):
         return
     try:
-        # In a folder of the node's own user, who may put anything there.
+        # The folder may belong to the node's user, who may put anything there.
         certificate = x509.load_pem_x509_certificate(read_regular(path, MAX_FILE_BYTES))
         owners = [each.value for each in certificate.subject.get_attributes_for_oid(NameOID.COMMON_NAME)]
     except (OSError, ValueError):

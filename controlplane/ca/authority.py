@@ -1,4 +1,4 @@
-"""A CA in memory: issues, renews and revokes; remembers what it has issued."""
+"""Implements a CA in memory: it issues, renews and revokes, and remembers what it has issued."""
 
 from __future__ import annotations
 
@@ -37,18 +37,18 @@ DAY_S = 86_400.0
 
 DEFAULT_CA_DAYS = 3650.0
 DEFAULT_DAYS = 90.0
-"""Short enough that what was lost unnoticed ends by age, long enough to renew by hand."""
+"""Validity of a node's certificate: short enough that a key lost unnoticed expires, long enough to renew by hand."""
 
 BACKDATE_S = 300.0
-"""How far a certificate's beginning lies back: clocks of robots that are this slow still find it valid."""
+"""How far the start of a certificate is backdated: robots whose clocks are this slow still find it valid."""
 
 
 class AuthorityError(ValueError):
-    """The CA refuses; the text is one line that tells what to do."""
+    """The CA refuses; the text is one line that says what to do."""
 
 
 class Authority:
-    """A CA with its key, and those before it that nodes still believe. Times come from `clock` (seconds since 1970)."""
+    """A CA with its key, and the former CAs that nodes still trust. Times come from `clock` (seconds since 1970)."""
 
     def __init__(
         self,
@@ -66,28 +66,28 @@ class Authority:
         self.published_at = published_at
         self.former = list(former)
         self._past = list(past)
-        """Of each key that a retired CA certified, a certificate: a revoked one if there is one."""
+        """One certificate of each key that a retired CA certified: a revoked one if there is one."""
         self._clock = clock
 
     @classmethod
     def create(
         cls, name: str = "fleet", *, days: float = DEFAULT_CA_DAYS, clock: Callable[[], float] = time.time
     ) -> Authority:
-        """Make a new CA; `name` is for people."""
+        """Make a new CA; `name` is for human readers."""
         return cls(_own(name, days, clock()), clock=clock)
 
     @property
     def ca_pem(self) -> bytes:
-        """The CA's certificate, and those of the former CAs after it."""
+        """The CA's certificate, followed by those of the former CAs."""
         return b"".join(authority.own.certificate_pem for authority in (self, *self.former))
 
     @property
     def not_after(self) -> float:
-        """When the CA's certificate ends."""
+        """Expiry of the CA's certificate."""
         return self.own.certificate.not_valid_after_utc.timestamp()
 
     def record(self) -> Record:
-        """Return what is to be remembered of this CA beside its key and certificate."""
+        """Return what must be stored of this CA besides its key and certificate."""
         serial, entries = self.own.certificate.serial_number, tuple(self.entries)
         return Record(serial, self.crl_number, entries, self.published_at, tuple(self._past))
 
@@ -109,7 +109,7 @@ class Authority:
     def renew(self, name: str, *, days: float = DEFAULT_DAYS, key: ec.EllipticCurvePrivateKey | None = None) -> Issued:
         """Make a further certificate for a name, and a new key unless one is given; raises AuthorityError.
 
-        The certificate before it stays good until its end, so that the node can change over without a gap.
+        The previous certificate stays valid until its end, so that the node can switch without a gap.
         """
         last = self._renewable(name)
         if key is not None:
@@ -119,7 +119,7 @@ class Authority:
     def sign(self, request: Request, *, renewing: bool = False, days: float = DEFAULT_DAYS) -> x509.Certificate:
         """Certify the key of a request whose name and role the operator has confirmed; raises AuthorityError.
 
-        As `issue`, or as `renew`. A key serves one name, and no more once it was revoked.
+        It works like `issue`, or `renew`. A key serves one name only, and none once it was revoked.
         """
         name = request.name
         self._refuse_key(
@@ -156,7 +156,7 @@ class Authority:
         return last
 
     def revoke(self, name: str, reason: x509.ReasonFlags = x509.ReasonFlags.unspecified) -> list[Entry]:
-        """Revoke every certificate of a name that is in force; returns them. Raises AuthorityError if there is none."""
+        """Revoke and return all certificates in force of a name; raises AuthorityError if there is none."""
         self.latest(name)
         revoked = [entry for authority in (self, *self.former) for entry in authority._revoke(name, reason)]
         if not revoked:
@@ -176,9 +176,9 @@ class Authority:
         return revoked
 
     def adopt(self, lists: Iterable[x509.CertificateRevocationList]) -> None:
-        """Take over what this CA has signed already and does not remember, as a command was cut short in between.
+        """Take over lists that this CA signed but does not remember, because a command was interrupted.
 
-        A node may have that list: what it revokes stays revoked, and the next one has a higher number.
+        A node may have such a list: what it revokes stays revoked, and the next list has a higher number.
         """
         for one in lists:
             if one.issuer != self.own.certificate.subject or not one.is_signature_valid(self.own.key.public_key()):
@@ -197,7 +197,8 @@ class Authority:
     def publish(self) -> None:
         """Sign the revocation lists again, unchanged, so that nodes can see that they miss none.
 
-        That of a former CA that has ended stays: nobody believes it any more. Raises AuthorityError if this one has.
+        The list of an expired former CA stays: nobody trusts that CA any more. Raises AuthorityError if this one has
+        expired.
         """
         now = self._clock()
         if now >= self.not_after:
@@ -208,9 +209,9 @@ class Authority:
                 authority.published_at = now
 
     def rotate(self, name: str, *, days: float = DEFAULT_CA_DAYS) -> None:
-        """Make a new CA that issues from now on; the one before it stays believed until `retire`.
+        """Make a new CA that issues from now on; the previous one stays trusted until `retire`.
 
-        No node can show a certificate of the new CA before the others have its `ca_pem`.
+        No node may present a certificate of the new CA before the others have its `ca_pem`.
         """
         if len(self.former) + 1 >= MAX_CA_CERTIFICATES:
             raise AuthorityError(f"nodes believe {MAX_CA_CERTIFICATES} CAs at most; do first: plr ca retire")
@@ -219,7 +220,7 @@ class Authority:
         self.former.insert(0, before)
 
     def retire(self) -> None:
-        """Forget the former CAs; raises AuthorityError while a node has a certificate of theirs only."""
+        """Forget the former CAs; raises AuthorityError while a node has only a certificate of theirs."""
         now = self._clock()
         renewed = {entry.name for entry in self.entries if entry.in_force(now)}
         waiting = sorted({entry.name for entry in self.all_entries() if entry.in_force(now)} - renewed)
@@ -229,7 +230,7 @@ class Authority:
                 + ", ".join(waiting[:5])
                 + (f" and {len(waiting) - 5} more" if len(waiting) > 5 else "")
             )
-        # Their certificates end with them; their keys do not, and may be asked for again.
+        # Their certificates end with them, but not the nodes' keys: a request may present one again.
         past = {entry.key: entry for entry in self._past}
         for authority in reversed(self.former):
             for entry in authority.entries:
@@ -250,9 +251,9 @@ class Authority:
         raise AuthorityError(f"{name} has no certificate of this CA; {meant}; {new}")
 
     def crl_pem(self) -> bytes:
-        """Return the revocation lists of this CA and the former ones; each stands as long as its CA.
+        """Return the revocation lists of this CA and the former ones; each is valid as long as its CA.
 
-        The same bytes until something is revoked, or `publish`.
+        The bytes stay the same until a revocation, or `publish`.
         """
         return b"".join(authority._own_crl_pem() for authority in (self, *self.former))
 
@@ -261,7 +262,7 @@ class Authority:
             (entry.serial, entry.revoked_at, entry.reason) for entry in self.entries if entry.revoked_at is not None
         ]
         begin = self.own.certificate.not_valid_before_utc.timestamp()
-        # Older versions noted no time when they revoked.
+        # Older versions recorded no time of publication.
         signed_at = self.published_at or max((begin, *(revoked_at for _, revoked_at, _ in revoked)))
         validity = Validity(signed_at, self.not_after)
         return build_revocation_list(self.own, self.crl_number, revoked, validity).public_bytes(Encoding.PEM)
@@ -275,7 +276,7 @@ class Authority:
         days: float = DEFAULT_DAYS,
         validity: Validity | None = None,
     ) -> Issued:
-        """Issue to a new name and write a folder ready to be a `tls_dir`; raises as `issue`, and OSError."""
+        """Issue to a new name and write a folder that can serve as `tls_dir`; raises as `issue`, and OSError."""
         issued = self.issue(name, role, days=days, validity=validity)
         write_tls_files(folder, issued, self.ca_pem, self.crl_pem())
         return issued

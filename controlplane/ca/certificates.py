@@ -1,7 +1,7 @@
 """Builds the X.509 structures that a CA signs: its own certificate, those of nodes, and its revocation list.
 
-Signatures are deterministic (RFC 6979): the CA's key does not hang on the quality of randomness in every signature, and
-an unchanged revocation list is the same bytes. `protos.trust.identity` checks what is built here.
+Signatures are deterministic (RFC 6979): the safety of the CA's key does not depend on good randomness in every
+signature, and an unchanged revocation list has the same bytes. `protos.trust.identity` checks what is built here.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ _HASH = hashes.SHA256()
 
 @dataclass(frozen=True, slots=True)
 class Validity:
-    """When a certificate is in force, seconds since 1970; both ends are rounded down to whole seconds."""
+    """Validity period of a certificate in seconds since 1970; both ends are rounded down to whole seconds."""
 
     not_before: float
     not_after: float
@@ -52,17 +52,17 @@ class Issued:
 
     @property
     def key_pem(self) -> bytes:
-        """The private key in PEM, in clear."""
+        """The private key in PEM, unencrypted."""
         return clear_pem(self.key)
 
 
 def generate_key() -> ec.EllipticCurvePrivateKey:
-    """Make a private key on P-256, the curve that gRPC's TLS takes."""
+    """Make a private key on P-256, the curve that gRPC's TLS accepts."""
     return ec.generate_private_key(ec.SECP256R1())
 
 
 def build_authority(name: str, key: ec.EllipticCurvePrivateKey, validity: Validity) -> x509.Certificate:
-    """Return the certificate of a CA, signed by itself, that may issue to nodes but make no further CA."""
+    """Return the self-signed certificate of a CA that may issue to nodes but create no further CA."""
     subject = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, name)])
     builder = _builder(subject, subject, key.public_key(), validity)
     builder = builder.add_extension(x509.BasicConstraints(ca=True, path_length=0), critical=True)
@@ -87,7 +87,7 @@ def build_leaf(
 
 
 def alternative_names(name: str, role: IdentityRole) -> x509.SubjectAlternativeName:
-    """Return where name and role stand."""
+    """Return the extension that holds name and role."""
     names: list[x509.GeneralName] = [x509.UniformResourceIdentifier(identity_uri(name, role))]
     if role is IdentityRole.CONTROL_PLANE:
         names.append(x509.DNSName(CONTROL_PLANE_DNS))
@@ -97,7 +97,7 @@ def alternative_names(name: str, role: IdentityRole) -> x509.SubjectAlternativeN
 def build_revocation_list(
     issuer: Issued, number: int, revoked: Iterable[tuple[int, float, str]], validity: Validity
 ) -> x509.CertificateRevocationList:
-    """Return the list of (serial number, time of revocation, reason) that the CA no longer stands for."""
+    """Return the signed list of revoked certificates; `revoked` holds (serial number, time of revocation, reason)."""
     builder = (
         x509.CertificateRevocationListBuilder()
         .issuer_name(issuer.certificate.subject)
@@ -110,7 +110,7 @@ def build_revocation_list(
         entry = x509.RevokedCertificateBuilder().serial_number(serial).revocation_date(_time(revoked_at))
         flag = x509.ReasonFlags(reason)
         if flag is not x509.ReasonFlags.unspecified:
-            # RFC 5280 section 5.3.1: no reason is said by leaving the extension out.
+            # RFC 5280 section 5.3.1: an unspecified reason is expressed by omitting the extension.
             entry = entry.add_extension(x509.CRLReason(flag), critical=False)
         builder = builder.add_revoked_certificate(entry.build())
     return builder.sign(issuer.key, _HASH, ecdsa_deterministic=True)

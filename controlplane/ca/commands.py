@@ -1,4 +1,4 @@
-"""`plr ca`: the fleet's CA on the command line; `plr request`: what a node asks of it."""
+"""Defines `plr ca`, the fleet's CA on the command line, and `plr request`, a node's request to it."""
 
 from __future__ import annotations
 
@@ -253,7 +253,7 @@ def _reported(
 
 
 def _tell_of_what_is_done(shown: str) -> None:
-    """Print it; a script that took this for refused would do it again, and find the name taken."""
+    """Print the outcome, and never fail: a script that took that for a refusal would retry and find the name taken."""
     if sys.stdout is None:
         return
     try:
@@ -265,7 +265,7 @@ def _tell_of_what_is_done(shown: str) -> None:
 
 
 def _complain(problem: str) -> None:
-    # It may name a file that somebody else has named.
+    # The problem may contain a file name chosen by somebody else.
     sys.stderr.write(f"plr: {escaped(problem)}\n")
 
 

@@ -1,4 +1,4 @@
-"""Writing files so that a reader finds the old or the new one whole, and keys so that only their owner reads them."""
+"""Writes files so that a reader finds the old or the new one whole, and keys so that only their owner can read them."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ PUBLIC_FILE = 0o644
 
 
 def write_atomically(path: Path, data: bytes, mode: int) -> None:
-    """Put the file in place whole, with this mode, and on the disk before it returns; raises OSError.
+    """Replace the file as a whole, with this mode, and return once it is on disk; raises OSError.
 
-    It belongs to whom its folder belongs, so that root can renew what a service reads.
+    The file gets the owner of its folder, so that root can renew what a service reads.
     """
     owner = path.parent.stat()
     descriptor, temporary = tempfile.mkstemp(prefix=f".{path.name}.", dir=path.parent)
@@ -49,14 +49,14 @@ def write_atomically(path: Path, data: bytes, mode: int) -> None:
 
 
 def write_tls_files(folder: Path, issued: Issued, ca_pem: bytes, crl_pem: bytes) -> None:
-    """Write a node's TLS files; a folder that is missing is made, readable for its owner alone. Raises OSError."""
+    """Write a node's TLS files; a missing folder is made, accessible only to its owner. Raises OSError."""
     write_certificate(folder, issued.certificate_pem, ca_pem, crl_pem, issued.key_pem)
 
 
 def write_certificate(
     folder: Path, certificate_pem: bytes, ca_pem: bytes, crl_pem: bytes, key_pem: bytes | None = None
 ) -> None:
-    """Write a node's TLS files, without the key if only the node has it; as `write_tls_files`. Raises OSError."""
+    """Write a node's TLS files as `write_tls_files` does, without the key if only the node has it; raises OSError."""
     make_private(folder)
     write_atomically(folder / CA_FILE, ca_pem, PUBLIC_FILE)
     write_atomically(folder / CRL_FILE, crl_pem, PUBLIC_FILE)
@@ -66,15 +66,15 @@ def write_certificate(
 
 
 def make_private(folder: Path) -> None:
-    """Make a folder that is missing, readable for its owner alone; raises OSError, as `refuse_planted` does."""
+    """Make a folder if it is missing, accessible only to its owner; raises OSError, as `refuse_planted` does."""
     folder.mkdir(mode=PRIVATE_FOLDER, parents=True, exist_ok=True)
     refuse_planted(folder)
 
 
 def refuse_planted(folder: Path) -> None:
-    """Raise OSError if a folder for a key was made by another user where everybody may make some, as in /tmp.
+    """Raise OSError if another user made a folder for a key where everybody may create folders, as in /tmp.
 
-    Elsewhere it may well be another user's, such as a service's.
+    Elsewhere it may well belong to another user, such as a service.
     """
     owner = folder.stat().st_uid
     if owner not in (0, os.geteuid()) and folder.absolute().parent.stat().st_mode & stat.S_IWOTH:

@@ -1,12 +1,12 @@
-"""A CA on disk.
+"""Keeps a CA on disk.
 
     index.json               the CAs, the one that issues first, and what each has issued and revoked
     authorities/SERIAL/      cert.pem and key.pem of each; the key under a passphrase, unless refused
     ca.pem, crl.pem          what every node needs, written from the above
     nodes/NAME/              a folder for each node, ready to be its `tls_dir`
 
-The folder is its owner's alone, every file is replaced whole, and one command at a time changes anything. index.json
-alone says what is: a command cut short before it has written that has not happened.
+Only its owner may access the folder, every file is replaced as a whole, and only one command at a time changes
+anything. index.json alone is authoritative: a command interrupted before it has written that has not happened.
 """
 
 from __future__ import annotations
@@ -45,39 +45,39 @@ _LOCK_FILE = ".lock"
 _PEM_LIST = re.compile(rb"-----BEGIN X509 CRL-----.*?-----END X509 CRL-----", re.DOTALL)
 
 MAX_INDEX_BYTES = 64 << 20
-"""Some 200,000 certificates; what would be more is not written."""
+"""Longest index, some 200,000 certificates; a longer one is not written."""
 
 _TEMPORARY = re.compile(r"\.(index\.json|(ca|crl|cert|key)\.pem)\.[^.]{8}")
-"""What a command leaves behind that was cut short while it wrote a file: maybe a key."""
+"""Name of a file that a command leaves behind if interrupted while writing; it may hold a key."""
 
 NOT_THE_OWNER = 0o077
-"""Permissions that nothing of a CA's has to have."""
+"""Permissions that no file of a CA needs."""
 
 
 class Protection(enum.IntEnum):
-    """How well a CA's keys are kept from whoever gets hold of the files, the worst first."""
+    """How well a CA's keys are protected from somebody who obtains the files, the worst first."""
 
     CLEAR = 0
     WEAK = 1
-    """Encrypted, but guesses at the passphrase are cheap: as older versions wrote it."""
+    """Encrypted as older versions did it: guesses at the passphrase are cheap."""
     GOOD = 2
 
 
 class AuthorityFolder:
-    """Where a CA is kept; `passphrase` is for its private keys."""
+    """The folder that holds a CA; `passphrase` is for its private keys."""
 
     def __init__(self, path: Path, passphrase: bytes | None = None, on_wait: Callable[[], None] = lambda: None) -> None:
-        """`on_wait` is called when another command is at work here, before it is waited for."""
+        """Open the folder; `on_wait` is called before waiting for another command at work here."""
         self.path = path
         self._passphrase = passphrase
         self._on_wait = on_wait
 
     def node_folder(self, name: str) -> Path:
-        """Where a node's files go unless told otherwise."""
+        """Return the default folder for a node's files."""
         return self.path / NODES / name
 
     def create(self, authority: Authority) -> None:
-        """Keep a new CA; raises ConfigError if there is one, or the folder holds anything else, and OSError."""
+        """Save a new CA; raises ConfigError if there is one already or the folder holds anything else, and OSError."""
         self.refuse_existing()
         self._refuse_other_things()
         self.path.mkdir(mode=PRIVATE_FOLDER, parents=True, exist_ok=True)
@@ -88,12 +88,12 @@ class AuthorityFolder:
             self.save(authority)
 
     def refuse_existing(self) -> None:
-        """Raise ConfigError if there is a CA."""
+        """Raise ConfigError if there is a CA already."""
         if (self.path / INDEX_FILE).exists():
             raise ConfigError(str(self.path), "", "there is a CA already; another one needs another --dir")
 
     def _refuse_other_things(self) -> None:
-        """The folder will be its owner's alone: it must not be one that others use."""
+        """Refuse a folder that others use: only its owner will have access to it."""
         own = {AUTHORITIES, NODES, CA_FILE, CRL_FILE, _LOCK_FILE}
         if self.path.exists() and any(
             each.name not in own and not _TEMPORARY.fullmatch(each.name) for each in self.path.iterdir()
@@ -101,12 +101,12 @@ class AuthorityFolder:
             raise ConfigError(str(self.path), "", "holds other things; a CA needs a --dir of its own")
 
     def _refuse_others(self) -> None:
-        """Raise ConfigError if another user made the folder, or something in it: he would get at the keys."""
+        """Raise ConfigError if another user made the folder, or something in it, and so could obtain the keys."""
         for path in (self.path, *self.path.iterdir()):
             _refuse_strange(path, path.stat() if path == self.path else path.lstat())
 
     def protections(self) -> list[Protection]:
-        """Return how each of the CAs' keys is kept; raises ConfigError."""
+        """Return how each of the CAs' keys is protected; raises ConfigError."""
         keys = [read_guarded(self._key_path(record), NOT_THE_OWNER) for record in self.records()]
         return [
             Protection.GOOD if is_well_encrypted(pem) else Protection.WEAK if is_encrypted(pem) else Protection.CLEAR
@@ -116,7 +116,7 @@ class AuthorityFolder:
     def change_passphrase(self, new: bytes | None) -> None:
         """Encrypt the CAs' keys with another passphrase, or not at all; raises ConfigError, OSError.
 
-        Cut short, it has changed some keys and not others: given again, it changes the rest.
+        If interrupted, it has changed only some keys; run again, it changes the rest.
         """
         self._check()
         with self._lock():
@@ -149,7 +149,7 @@ class AuthorityFolder:
             yield first
 
     def _sweep(self) -> None:
-        """Delete what commands left behind that were cut short."""
+        """Delete what interrupted commands left behind."""
         for folder in (self.path, *(self.path / AUTHORITIES).glob("*"), *(self.path / NODES).glob("*")):
             with contextlib.suppress(OSError):
                 for path in folder.iterdir():
@@ -157,7 +157,7 @@ class AuthorityFolder:
                         path.unlink()
 
     def _lists(self) -> tuple[x509.CertificateRevocationList, ...]:
-        """Return the revocation lists that stand here: of a command cut short, nodes may have them already."""
+        """Return the revocation lists stored here: nodes may already have those of an interrupted command."""
         try:
             pem = read_regular(self.path / CRL_FILE, MAX_INDEX_BYTES)
             return tuple(x509.load_pem_x509_crl(one) for one in _PEM_LIST.findall(pem))
@@ -179,14 +179,14 @@ class AuthorityFolder:
             raise ConfigError(str(path), "", "expected a certificate in PEM") from error
 
     def save(self, authority: Authority) -> list[str]:
-        """Keep the CA as it is now; returns nodes' folders that could not be brought up to date, and why.
+        """Save the CA; return the nodes' folders that could not be updated, and why.
 
-        The revocation list is written before the index: cut short in between, the next command takes it for done. The
-        other way round the certificate would count as revoked, and no node would hear of it.
+        The revocation list is written before the index: after an interruption in between, the next command adopts the
+        list. The other way round the certificate would count as revoked, and no node would learn of it.
 
         Raises:
             OSError: a file of the CA's own cannot be written.
-            ConfigError: the index has become too long; nothing was written.
+            ConfigError: the index would be too long; nothing was written.
         """
         records = [each.record() for each in (authority, *authority.former)]
         index = encode_index(records)
@@ -208,12 +208,12 @@ class AuthorityFolder:
         return problems
 
     def _refresh_nodes(self, current: Mapping[str, bytes]) -> list[str]:
-        """Give every node's folder the CAs and revocations of now: whoever copies it again takes nothing back."""
+        """Write the current CAs and revocations into every node's folder, so that copying it again undoes nothing."""
         problems = []
         for name, data in current.items():
             for path in (self.path / NODES).glob(f"*/{name}"):
                 try:
-                    # A service's folder is its own: it may hold anything under this name.
+                    # A service owns its folder: it may hold anything under this name.
                     if read_regular(path, len(data) + 1) != data:
                         write_atomically(path, data, PUBLIC_FILE)
                 except OSError as error:

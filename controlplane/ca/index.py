@@ -1,4 +1,4 @@
-"""What a CA has issued and revoked, and how that is written down (index.json)."""
+"""Records what a CA has issued and revoked, and encodes it as index.json."""
 
 from __future__ import annotations
 
@@ -33,10 +33,10 @@ LAST_MOMENT = 253_402_300_799.0
 """The last second of the year 9999 (seconds since 1970), at which a certificate may end (RFC 5280)."""
 
 MAX_CRL_NUMBER = (1 << 159) - 1
-"""20 octets hold it (RFC 5280)."""
+"""Largest number that fits 20 octets (RFC 5280)."""
 
 MAX_SERIAL = (1 << 159) - 1
-"""The same; above 0."""
+"""The same limit; serial numbers are above 0."""
 
 _REASONS = frozenset(reason.value for reason in ReasonFlags)
 
@@ -53,24 +53,24 @@ class Entry:
     revoked_at: float | None = None
     reason: str = ""
     key: str = ""
-    """The key's fingerprint; empty for what older versions issued."""
+    """The key's fingerprint; empty if an older version issued the certificate."""
 
     def in_force(self, now_wall: float) -> bool:
-        """Whether the certificate is neither revoked nor past its time."""
+        """Return whether the certificate is neither revoked nor expired."""
         return self.revoked_at is None and now_wall <= self.not_after
 
 
 @dataclass(frozen=True, slots=True)
 class Record:
-    """What one CA has done: its certificate's serial number, its last revocation list's number, what it issued."""
+    """The history of one CA: its certificate's serial number, its last revocation list's number, what it issued."""
 
     serial: int
     crl_number: int
     entries: tuple[Entry, ...]
     published_at: float | None = None
-    """When the list was signed without anything new in it; None: never."""
+    """When the revocation list was last signed, with or without anything new; None if no time is recorded."""
     past: tuple[Entry, ...] = ()
-    """What CAs before it, no longer believed, certified: a key of theirs that was revoked stays refused."""
+    """Certificates of former CAs that are no longer trusted: a revoked key among them stays refused."""
 
 
 def _number(text: object) -> int:
@@ -83,7 +83,7 @@ def _number(text: object) -> int:
 
 
 _Serial = Annotated[int, BeforeValidator(_number)]
-"""Written as hexadecimal text: its 160 bits are more than other JSON readers keep of a number."""
+"""Serial number as hexadecimal text: other JSON readers do not keep the 160 bits of such a number."""
 
 _Name = Annotated[str, AfterValidator(lambda text: node_name(text, "the name"))]
 
@@ -168,7 +168,7 @@ def _row(entry: Entry) -> dict[str, object]:
 
 
 def decode_index(data: bytes, path: Path) -> tuple[Record, ...]:
-    """Return what the CAs have done, the one that issues first; raises ConfigError, which names `path`."""
+    """Return the records of the CAs, the issuing one first; raises ConfigError, which names `path`."""
     try:
         index = _Index.model_validate_json(data)
     except ValidationError as error:

@@ -1,4 +1,4 @@
-"""A CA's key in a file: PKCS #8 in PEM, encrypted with scrypt and AES-256-CBC (PBES2), or in clear.
+"""Encodes a CA's key for a file: PKCS #8 in PEM, encrypted with scrypt and AES-256-CBC (PBES2), or unencrypted.
 
     EncryptedPrivateKeyInfo ::= SEQUENCE {                                 RFC 5958
         SEQUENCE { PBES2, SEQUENCE {                                       RFC 8018
@@ -6,8 +6,8 @@
             SEQUENCE { aes256-CBC, iv } } }
         OCTET STRING }                                                     the key's PrivateKeyInfo, padded (PKCS #7)
 
-The library reads this, and so does OpenSSL (`openssl pkey -in key.pem`), but it writes nothing better in PKCS #8 than
-2,048 rounds of PBKDF2. Hence the few bytes of DER here.
+The library reads this, and so does OpenSSL (`openssl pkey -in key.pem`). But the library writes PKCS #8 with nothing
+better than 2,048 rounds of PBKDF2. Hence the few bytes of DER here.
 """
 
 from __future__ import annotations
@@ -27,14 +27,14 @@ if TYPE_CHECKING:
     from cryptography.hazmat.primitives.asymmetric import ec
 
 SCRYPT_N = 1 << 14
-"""With r: 16 MiB for each guess. The most that OpenSSL's command line opens: it refuses 32 MiB."""
+"""With r this takes 16 MiB for each guess, the most that OpenSSL's command line opens: it refuses 32 MiB."""
 
 SCRYPT_R = 8
 
 SCRYPT_P = 16
-"""How often those 16 MiB are gone through: 0.6 s of a processor where this was written, 1,500 times as much as before.
+"""Passes over those 16 MiB: 0.6 s of a processor where this was written, 1,500 times as much as before.
 
-Three times the least that OWASP asks for with this N and r (p = 5).
+This is three times the minimum that OWASP asks for with this N and r (p = 5).
 """
 
 _SALT_BYTES = 16
@@ -56,7 +56,7 @@ def clear_pem(key: ec.EllipticCurvePrivateKey) -> bytes:
 
 
 def encrypted_pem(key: ec.EllipticCurvePrivateKey, passphrase: bytes) -> bytes:
-    """Return the key in PEM, encrypted; takes as long as one guess."""
+    """Return the key in PEM, encrypted; this takes as long as one guess."""
     salt, iv = os.urandom(_SALT_BYTES), os.urandom(_BLOCK_BITS // 8)
     derived = Scrypt(salt=salt, length=_KEY_BYTES, n=SCRYPT_N, r=SCRYPT_R, p=SCRYPT_P).derive(passphrase)
     padder = PKCS7(_BLOCK_BITS).padder()
@@ -70,18 +70,18 @@ def encrypted_pem(key: ec.EllipticCurvePrivateKey, passphrase: bytes) -> bytes:
 
 
 def is_encrypted(pem: bytes) -> bool:
-    """Whether the key needs a passphrase."""
+    """Return whether the key needs a passphrase."""
     return b"ENCRYPTED" in pem
 
 
 def is_well_encrypted(pem: bytes) -> bool:
-    """Whether the key is encrypted as it would be today: a guess at its passphrase costs what `encrypted_pem` does."""
+    """Return whether the key is encrypted as `encrypted_pem` does it today, so that a guess costs as much."""
     body = pem.partition(_BEGIN)[2].partition(_END)[0]
     try:
         der = base64.b64decode(b"".join(body.split()), validate=True)
     except binascii.Error:
         return False
-    # A salt has 8 bytes where OpenSSL wrote the file.
+    # The salt has 8 bytes if OpenSSL wrote the file.
     kdf = re.escape(_tlv(_OID, _SCRYPT)) + rb"\x30.\x04[\x08-\x20].{8,32}" + re.escape(_costs())
     return re.search(kdf, der, re.DOTALL) is not None
 
@@ -91,12 +91,12 @@ def _costs() -> bytes:
 
 
 def _number(value: int) -> bytes:
-    # A bit more than it needs: the first one is the sign.
+    # One bit more than the value needs: the first bit is the sign.
     return value.to_bytes(value.bit_length() // 8 + 1, "big")
 
 
 def _tlv(tag: int, content: bytes) -> bytes:
-    """One DER element: its tag, the length of the content, and that."""
+    """Return one DER element: its tag, the length of the content, and the content."""
     size = len(content)
     if size < 0x80:
         return bytes((tag, size)) + content

@@ -1,4 +1,4 @@
-"""What a CA has issued, as text for a terminal."""
+"""Formats what a CA has issued as text for a terminal."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ _DAY_S = 86_400.0
 
 
 def day(seconds: float) -> str:
-    """Write a moment (seconds since 1970) as a day, UTC."""
+    """Return the UTC day of a time in seconds since 1970."""
     return time.strftime("%Y-%m-%d", time.gmtime(seconds))
 
 
 def render(records: Sequence[Record], certificates: Iterable[x509.Certificate], now_wall: float) -> str:
-    """One row a certificate: the CAs, then the nodes by name, the newest of a name last."""
+    """Return one row a certificate: the CAs, then the nodes by name, the newest of a name last."""
     rows = [_HEADER]
     for record, certificate in zip(records, certificates, strict=True):
         name = str(certificate.subject.get_attributes_for_oid(NameOID.COMMON_NAME)[0].value)

@@ -1,6 +1,6 @@
-"""Where the passphrase of a CA's key comes from: a file, the environment, or whoever sits at the terminal.
+"""Gets the passphrase of a CA's key from a file, the environment, or the user at the terminal.
 
-Nobody is asked where there is no terminal: a command in a script ends with one line that says what to give it.
+Without a terminal nobody is asked: a command in a script ends with one line that says what to give it.
 """
 
 from __future__ import annotations
@@ -21,10 +21,10 @@ VARIABLE = "PLR_CA_PASSPHRASE"
 NEW_VARIABLE = "PLR_CA_NEW_PASSPHRASE"
 
 MIN_BYTES = 8
-"""Shorter ones are found by trying, however much a guess costs: NIST SP 800-63B asks for no fewer either."""
+"""Shorter ones are found by trial, however costly a guess is; NIST SP 800-63B sets the same minimum."""
 
 MAX_BYTES = 1023
-"""The longest that OpenSSL takes."""
+"""The longest that OpenSSL accepts."""
 
 _NOT_THE_OWNER = 0o077
 
@@ -39,14 +39,14 @@ class PassphraseSource:
     file: Path | None = None
 
     def given(self) -> bytes | None:
-        """Return it, or None if it was not given; raises ConfigError."""
+        """Return the passphrase, or None if none was given; raises ConfigError."""
         if self.file is not None:
             return _not_empty(read_guarded(self.file, _NOT_THE_OWNER).strip(b"\r\n"), str(self.file))
         text = os.environ.get(self.variable)
         return None if text is None else _not_empty(os.fsencode(text), self.variable)
 
     def get(self) -> bytes:
-        """Return it, asked for if need be; raises ConfigError."""
+        """Return the passphrase, asking for it if need be; raises ConfigError."""
         passphrase = self.given()
         if passphrase is not None:
             return passphrase
@@ -54,7 +54,7 @@ class PassphraseSource:
         return _not_empty(_ask(f"{self.what}: "), self.what)
 
     def choose(self) -> bytes:
-        """Return one for a key that is yet to be encrypted, asked for twice if need be; raises ConfigError."""
+        """Return a passphrase for a key yet to be encrypted, asking twice if need be; raises ConfigError."""
         passphrase = self.given()
         if passphrase is not None:
             return _checked(passphrase, self.variable if self.file is None else str(self.file))

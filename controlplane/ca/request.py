@@ -1,12 +1,12 @@
-"""A node's request for a certificate: PKCS #10 with its name and role, signed with the key that stays on the node.
+"""Builds and parses a node's certificate request: PKCS #10 with name and role, signed with the key kept on the node.
 
     subject          CN=robot-7
     public key       ECDSA on P-256
     attributes       one extension request, of one extension:
     subjectAltName   as the certificate's (protos/trust/identity.py)
 
-A request proves that who made it has the key, and nothing else: whoever made it wrote down the name and role. So the CA
-takes its key only, and name and role from the operator. Who asks for more than a certificate of ours holds is refused.
+A request proves that its maker has the key, and nothing else: its name and role are only claims. So the CA takes only
+the key from it, and name and role from the operator. A request for more than our certificates hold is refused.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ _EXTENSION_REQUEST = "1.2.840.113549.1.9.14"
 
 @dataclass(frozen=True, slots=True)
 class Request:
-    """What a node asks for; that it has the key is checked, that it is who it says is not."""
+    """A parsed request: that the node has the key is checked, its identity is not."""
 
     name: NodeName
     role: IdentityRole
@@ -48,7 +48,7 @@ class Request:
 
 
 def fingerprint(key: ec.EllipticCurvePublicKey) -> str:
-    """Return what people compare, and the CA knows a key by: SHA-256 of its SubjectPublicKeyInfo in base64."""
+    """Return the SHA-256 of the SubjectPublicKeyInfo in base64: people compare it, and the CA identifies keys by it."""
     digest = hashlib.sha256(key.public_bytes(Encoding.DER, PublicFormat.SubjectPublicKeyInfo)).digest()
     return "SHA256:" + base64.b64encode(digest).rstrip(b"=").decode()
 
@@ -63,7 +63,7 @@ def build_request(name: str, role: IdentityRole, key: ec.EllipticCurvePrivateKey
 
 
 def parse_request(pem: bytes) -> Request:
-    """Return what is asked for; raises DecodeError, whose text is fit for a terminal."""
+    """Return the parsed request; raises DecodeError, whose text is fit for a terminal."""
     if len(pem) > MAX_REQUEST_BYTES:
         raise DecodeError(f"the request is longer than {MAX_REQUEST_BYTES} bytes")
     try:
@@ -71,7 +71,7 @@ def parse_request(pem: bytes) -> Request:
     except DecodeError:
         raise
     except Exception as error:
-        # As with certificates: a dozen kinds of errors, some only when a field is first looked at.
+        # As with certificates, there are a dozen kinds of errors, some raised only when a field is first read.
         raise DecodeError(f"the request is malformed: {type(error).__name__}") from error
 
 
@@ -95,7 +95,7 @@ def _checked(request: x509.CertificateSigningRequest) -> Request:
     if list(request.subject) != [x509.NameAttribute(NameOID.COMMON_NAME, name)]:
         subject = request.subject.rfc4514_string()
         raise DecodeError(f"the request's subject is {subject!a}, expected the name alone: CN={name}")
-    # The same key can be written in several ways: with the curve's parameters, or compressed. Here there is one.
+    # A key has several encodings, such as with the curve's parameters or compressed. Reduce them to one.
     point = key.public_bytes(Encoding.X962, PublicFormat.UncompressedPoint)
     return Request(name, role, ec.EllipticCurvePublicKey.from_encoded_point(ec.SECP256R1(), point))
 

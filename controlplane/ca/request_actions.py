@@ -1,4 +1,4 @@
-"""What `plr request` and `plr ca sign` do: a certificate for a key that stays on its node."""
+"""Carries out `plr request` and `plr ca sign`: a certificate for a key that stays on its node."""
 
 from __future__ import annotations
 
@@ -100,7 +100,7 @@ def _read(path: Path) -> Request:
 
 
 def _confirm(arguments: argparse.Namespace, asked: Request, records: Iterable[Record]) -> None:
-    """Return if the operator wants just this, by options or at the terminal; raises AuthorityError or ConfigError."""
+    """Return if the operator confirms this, by options or at the terminal; raises AuthorityError or ConfigError."""
     name, role, key = asked.name, asked.role.value, fingerprint(asked.key)
     for what, wanted, found in (
         ("name", arguments.name, name),
