@@ -1,4 +1,4 @@
-"""A network laboratory on one machine, out of network namespaces.
+"""Builds a network laboratory on one machine from network namespaces.
 
      robot                                                         internet
     ┌───────────┐  emulated link   ┌────────────────┐              ┌──────┐      ┌─────────┐
@@ -12,7 +12,7 @@
                                                                    └──────┘      └─────────┘
 
 Every box is a set of namespaces of its own (network, mount, host name, IPC), with its own /dev/shm and
-/etc/hosts; file system, users and working directory are the caller's. IPv4 and IPv6 throughout; the
+/etc/hosts; file system, users and working directory are the caller's. IPv4 and IPv6 work throughout; the
 routers translate IPv4 and filter both. Each `~~~` is a process (`lab.emulator`) that carries
 the frames between two TAP devices through a seeded `LinkModel`.
 
@@ -42,11 +42,11 @@ the frames between two TAP devices through a seeded `LinkModel`.
         lab.nat("wwan0").rebind()               # the carrier forgets its mappings: new ports
 
 Needs Linux, iproute2, nftables, util-linux; root, or an ordinary user who may make user namespaces.
-When the `with` block ends, or the process that made the lab dies however it dies, the kernel takes the
-lab's PID namespace down: no process, namespace, interface or rule is left. Programs are killed then, not
-asked; stop them before if they must end well.
+When the `with` block ends, or the process that made the lab dies in any way, the kernel takes down the
+lab's PID namespace: no process, namespace, interface or rule is left. Programs are killed then, not
+asked to stop; stop them before if they must end cleanly.
 
-A host's interface has a default route per interface, metrics 100, 200, ... in the order of the interfaces,
+A host has a default route for each interface, with metrics 100, 200, ... in the order of the interfaces,
 and no reverse path filter: a socket bound to a device (SO_BINDTODEVICE) leaves through it.
 `python -m lab --help` opens a lab to look around in.
 """

@@ -1,4 +1,4 @@
-"""`python -m lab`: a lab to look around in."""
+"""`python -m lab`: opens a lab to look around in."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ examples:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Entry point; returns the exit code: 0 ok, 1 the lab failed, 2 bad usage; `exec` the program's."""
+    """Run the command and return the exit code: 0 ok, 1 the lab failed, 2 bad usage; for `exec` the program's."""
     arguments = _parser().parse_args(argv)
     try:
         config = LabConfig.of(
@@ -149,7 +149,7 @@ def _watch(lab: Lab, every_s: float) -> int:
         ready, _, _ = select.select(watched, (), (), max(0.0, next_report - time.monotonic()))
         if ready:
             data = os.read(sys.stdin.fileno(), 4096)
-            if not data:  # stdin closed: run on without commands
+            if not data:  # stdin is closed: go on without commands
                 watched = []
             *lines, typed = (typed + data.decode(errors="replace")).split("\n")
             for line in filter(None, map(str.strip, lines)):

@@ -1,4 +1,4 @@
-"""How much traffic the emulator carries on this machine, and how much delay it adds of its own."""
+"""Measures how much traffic the emulator carries on this machine, and how much delay it adds."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _UDP_SEGMENT = 103  # linux/udp.h
 _PACKET_BYTES = 1200
 _SEGMENTS = 40
 _PORT = 6000
-# Started with -S on a cloud host; one datagram back for each.
+# Runs with -S on a cloud host; returns one datagram for each.
 _ECHO = (
     "import socket,sys\n"
     "s=socket.socket(socket.AF_INET6,socket.SOCK_DGRAM)\n"
@@ -33,20 +33,20 @@ _ECHO = (
 
 @dataclass(frozen=True, slots=True)
 class Calibration:
-    """One link of an otherwise idle lab, zero delay. Times in microseconds, one way."""
+    """The results for one link of an otherwise idle lab with zero delay. Times are one-way, in microseconds."""
 
     port_kind: str
     packets_per_s: float
     cpu_share: float
-    """Of one core, at `packets_per_s`."""
+    """Share of one core used at `packets_per_s`."""
     added_p50_us: float
-    """Half the round trip over the emulated link and its NAT, less half the one over plain cables."""
+    """Half the round trip over the emulated link and its NAT, minus half of that over plain cables."""
     added_p99_us: float
     realtime: bool
 
 
 def start_echo(host: Host, port: int = _PORT) -> HostProcess:
-    """A UDP echo server on a host, IPv4 and IPv6; answers as soon as this returns."""
+    """Start a UDP echo server on a host, IPv4 and IPv6; it answers as soon as this returns."""
     server = host.popen([sys.executable, "-S", "-c", _ECHO, str(port)])
     probe = host.socket()
     with probe:
@@ -62,7 +62,7 @@ def start_echo(host: Host, port: int = _PORT) -> HostProcess:
 
 
 def calibrate(lab: Lab, interface: str, *, seconds: float = 2.0, round_trips: int = 2000) -> Calibration:
-    """Measure; resets the link."""
+    """Measure one link, and reset it."""
     robot, cloud, other = lab.config.robots[0].name, lab.config.clouds[0].name, lab.config.control.name
     link = lab.link(interface, host=robot)
     link.set(LinkProfile())

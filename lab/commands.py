@@ -27,7 +27,7 @@ _PROFILE_FIELDS = tuple(field.name for field in fields(LinkProfile))
 
 @dataclass(frozen=True, slots=True)
 class Command:
-    """A parsed line: either `verb` or `changes` (of LinkProfile fields) is set."""
+    """A parsed line, with either `verb` or `changes` (of LinkProfile fields) set."""
 
     interface: str
     host: str | None = None
@@ -41,7 +41,7 @@ def parse_command(line: str) -> Command:
     """Parse one line.
 
     Raises:
-        LabConfigError: not such a line, or a value out of range; says what was expected.
+        LabConfigError: the line is no command, or a value is out of range; the text says what was expected.
     """
     target, *words = line.replace(":", " ", 1).replace(",", " ").split() or [""]
     host, slash, interface = target.rpartition("/")
@@ -59,11 +59,11 @@ def parse_command(line: str) -> Command:
 
 
 def apply_command(lab: Lab, command: Command) -> None:
-    """Do it.
+    """Carry out a command.
 
     Raises:
-        LabError: no such link, host or router; or it died.
-        LabConfigError: values out of range.
+        LabError: no such link, host or router, or it died.
+        LabConfigError: a value is out of range.
     """
     interface, host = command.interface, command.host
     if command.verb == "rebind":

@@ -1,4 +1,4 @@
-"""The topology as text, with the addresses of a plan."""
+"""Draws the topology as text, with the addresses of a plan."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ if TYPE_CHECKING:
 
 
 def draw(config: LabConfig, plan: Plan) -> str:
-    """One line per interface: host, address, link, router with its public address; then all meet."""
+    """Return one line per interface: host, address, link, router with its public address; then where all meet."""
     rows: list[tuple[str, str, str]] = []
     for host in config.hosts:
         for interface in host.interfaces:

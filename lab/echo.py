@@ -28,7 +28,7 @@ def answer(request: Any, response: Any) -> dict[str, Any]:
         time.sleep(float(delay_ms or 0) / 1e3)
         response.message = "." * int(size or 0)
         response.success = True
-    except (ValueError, OverflowError):  # whoever may call may also say what means nothing
+    except (ValueError, OverflowError):  # a caller may also send nonsense
         response.success = False
     data = bytes(request.image.data)
     response.header = request.image.header
@@ -38,22 +38,22 @@ def answer(request: Any, response: Any) -> dict[str, Any]:
 
 
 class Burden:
-    """Makes a server as much slower as a file says, in milliseconds: others use it, more or fewer from time to time."""
+    """Slows a server down by the milliseconds in a file, as if others used it, more or fewer over time."""
 
     def __init__(self, file: Path) -> None:
         self._file = file
 
     def answer(self, request: Any, response: Any) -> dict[str, Any]:
-        """Answer later."""
+        """Answer after the delay."""
         time.sleep(float(self._file.read_text(encoding="utf-8")) / 1e3)
         return answer(request, response)
 
 
 class EchoRequests:
-    """Requests of one size, each with other bytes."""
+    """Requests of one size, each with different bytes."""
 
     def __init__(self, size: int, delay_ms: float, rng: random.Random, answer_bytes: tuple[int, int] = (0, 0)) -> None:
-        """`answer_bytes`: the least and the most that is asked back; each order of magnitude as often."""
+        """Prepare requests; `answer_bytes` bounds the sizes requested back, each order of magnitude equally likely."""
         self._size = size
         self._delay_ms = delay_ms
         self._rng = rng
@@ -81,7 +81,7 @@ class EchoRequests:
 
 
 def main() -> int:
-    """Command line."""
+    """Run the command line."""
     parser = argparse.ArgumentParser(description=__doc__)
     commands = parser.add_subparsers(dest="command", required=True)
     serve = commands.add_parser("serve")
@@ -111,7 +111,7 @@ def main() -> int:
 
 
 def journal_ids(path: Path) -> list[str]:
-    """Which requests a server ran, in order."""
+    """Return the requests that a server ran, in order."""
     return [json.loads(line)["id"] for line in path.read_text().splitlines()] if path.exists() else []
 
 

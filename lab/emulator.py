@@ -1,4 +1,4 @@
-"""The process behind one emulated link: frames from one port, through a `LinkModel`, to the other port.
+"""Runs one emulated link as a process: frames go from one port, through a `LinkModel`, to the other port.
 
 Requests arrive as JSON lines on an inherited socket, each answered by one line:
 
@@ -33,8 +33,8 @@ if TYPE_CHECKING:
 _ETHERNET_HEADER_BYTES = 14
 # Frames taken from one port before the other port, the timers and the requests get a turn.
 _BATCH_FRAMES = 64
-# The emulator shares its cores with what it measures; a late emulator falsifies every figure. With two
-# cores and three busy processes, its worst lateness was 0.2 ms so, 4 ms at niceness -10, 3 ms at 0.
+# The emulator shares its cores with what it measures, and a late emulator falsifies every figure. With two cores and
+# three busy processes, its worst lateness was 0.2 ms at this priority, 4 ms at niceness -10, 3 ms at 0.
 _REALTIME_PRIORITY = 1
 
 
@@ -74,7 +74,7 @@ class LinkEmulator:
         except PermissionError:
             self._realtime = False
         gc.freeze()
-        gc.disable()  # no cycles are made per frame, and a collection would stop every timer
+        gc.disable()  # frames create no cycles, and a collection would delay every timer
         directions = (self._up, self._down)
         sources = {direction.source.fileno(): direction for direction in directions}
         control = self._control.fileno()
@@ -111,7 +111,7 @@ class LinkEmulator:
             if frame is None:
                 return
             if frame[0] & 1:
-                # Multicast and broadcast: the kernel's own ARP and MLD. No router forwards them, and
+                # Multicast and broadcast are the kernel's own ARP and MLD. No router forwards them, and
                 # they must not use up draws that decide the fate of the traffic under test.
                 if self._dark is None:
                     direction.bypassed += 1

@@ -1,4 +1,4 @@
-"""The lab's errors: two, so that callers can tell their own mistake from the machine's."""
+"""Defines the lab's two errors, so that callers can tell their own mistakes from the machine's."""
 
 from __future__ import annotations
 
@@ -8,4 +8,4 @@ class LabError(RuntimeError):
 
 
 class LabConfigError(ValueError):
-    """A topology, link profile or trace that makes no sense; the text names the field."""
+    """A topology, link profile or trace is invalid; the text names the field."""

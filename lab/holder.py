@@ -1,8 +1,8 @@
-"""PID 1 of the lab: builds the plan inside its own namespaces, then holds them until told, or orphaned.
+"""Runs as PID 1 of the lab: builds the plan inside its own namespaces, then holds them until told, or orphaned.
 
-Runs as `python -S -m lab.holder LIFELINE_FD` in fresh PID, mount, network, IPC and
-UTS namespaces. As PID 1 its end is the end of every process of the lab, by the kernel's own rule, and
-with the processes go their namespaces, interfaces and rules. It ends when the lifeline closes.
+It is started as `python -S -m lab.holder LIFELINE_FD` in fresh PID, mount, network, IPC and UTS namespaces. When PID 1
+ends, the kernel ends every process of the lab, and with the processes go their namespaces, interfaces and rules. It
+ends when the lifeline closes.
 
 Every machine of the lab is an anchor: a child that holds the namespaces and sleeps.
 """
@@ -32,7 +32,7 @@ from lab.wire import LineSocket
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-# Frames a TAP holds for the emulator; the default 1000 is 12 ms at 1 Gbit/s.
+# Frames that a TAP holds for the emulator; the default of 1000 is 12 ms at 1 Gbit/s.
 _TAP_QUEUE_FRAMES = 4000
 _NAMESPACES = kernel.CLONE_NEWNET | kernel.CLONE_NEWNS | kernel.CLONE_NEWUTS | kernel.CLONE_NEWIPC
 
@@ -53,8 +53,8 @@ def main(argv: list[str]) -> None:
     hello, plan = lifeline.receive(), lifeline.receive()
     if hello is None or plan is None:
         return
-    # Handed over here and not inherited, as unshare would inherit them too and keep them open: the
-    # death of an emulator must show as the end of its control socket.
+    # Handed over here, not inherited: unshare would inherit them too and keep them open, but the death of an emulator
+    # must show as the end of its control socket.
     link_fds = [lifeline.take_descriptor() for _ in range(hello["links"])]
     holder = _Holder(plan, link_fds, lifeline_fd)
     try:
@@ -94,7 +94,7 @@ class _Holder:
         self._use_tap = plan["ports"] == "tap" or (plan["ports"] == "auto" and may_open_tun)
 
     def build(self) -> dict[str, int]:
-        """Everything of the plan; returns machine name -> anchor's PID, as seen in here."""
+        """Build the whole plan; return machine name -> PID of its anchor, as seen inside the lab."""
         for name, namespace in self._plan["namespaces"].items():
             self._anchors[name] = self._fork(partial(self._anchor, namespace), f"machine {name}")
         for segment in self._plan["segments"]:
@@ -153,7 +153,7 @@ class _Holder:
             hosts.write_text(self._plan["hosts_file"])
             kernel.mount(str(hosts), "/etc/hosts", None, kernel.MS_BIND)
             hosts.unlink()
-            with contextlib.suppress(OSError):  # only what looks under /sys/class/net misses it
+            with contextlib.suppress(OSError):  # only programs that read /sys/class/net miss it
                 kernel.mount("netlab", "/sys", "sysfs")
         for key, value in namespace["sysctls"].items():
             Path("/proc/sys", key).write_text(value)
@@ -217,7 +217,7 @@ def _make_packet_port(end: _End, own_name: str, mtu: int) -> Port:
     )
     Path(f"/proc/sys/net/ipv6/conf/{own_name}/disable_ipv6").write_text("1")
     with kernel.network_namespace_of(end.pid):
-        # The emulator sees frames as they would be on the wire: of MTU size, checksums filled in.
+        # The emulator sees frames as on the wire: of MTU size, with checksums filled in.
         kernel.disable_offloads(end.interface)
     return PacketPort(own_name)
 
@@ -233,7 +233,7 @@ def _feed(argv: list[str], text: str) -> None:
 
 
 def _reap(*_: object) -> None:
-    """Bury whoever died; orphans of the lab's processes become ours."""
+    """Reap dead processes; orphans of the lab's processes become our children."""
     with contextlib.suppress(ChildProcessError):
         while os.waitpid(-1, os.WNOHANG)[0]:
             pass

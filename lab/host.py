@@ -1,4 +1,4 @@
-"""A machine of a running lab: start programs on it, look up its addresses, pull its interfaces down."""
+"""Controls a machine of a running lab: starts programs on it, looks up its addresses, takes its interfaces down."""
 
 from __future__ import annotations
 
@@ -17,22 +17,22 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
     from concurrent.futures import Executor
 
-# nsenter needs a few ms to fork; far more means that the machine is overloaded or the lab is gone.
+# nsenter needs a few ms to fork; a much longer time means that the machine is overloaded or the lab is gone.
 _START_TIMEOUT_S = 10.0
-# Ends the program that follows when the thread that started it ends, however that comes about.
+# Kills the program that follows when the thread that started it ends, for whatever reason.
 DIE_WITH_PARENT = ("setpriv", "--pdeathsig", "KILL")
 
 
 class HostProcess(subprocess.Popen[bytes]):
     """A program on a lab host; as `subprocess.Popen`, but signals reach the program itself.
 
-    `pid` is the nsenter that waits for the program outside the lab and ends as it ends, with the same
+    `pid` is the nsenter that waits for the program outside the lab and ends with it, with the same
     return code (-9 after SIGKILL); `inner_pid` is the program, in the caller's numbering.
     """
 
     @property
     def inner_pid(self) -> int | None:
-        """The program's PID as the caller's /proc shows it; None: it has ended."""
+        """The program's PID as the caller's /proc shows it; None if it has ended."""
         deadline = time.monotonic() + _START_TIMEOUT_S
         while self.poll() is None:
             children = children_of(self.pid)
@@ -44,7 +44,7 @@ class HostProcess(subprocess.Popen[bytes]):
         return None
 
     def send_signal(self, sig: int) -> None:
-        """Send `sig` to the program; nothing happens if it has ended."""
+        """Send `sig` to the program; does nothing if it has ended."""
         pid = self.inner_pid
         if pid is not None:
             with contextlib.suppress(ProcessLookupError):
@@ -53,7 +53,7 @@ class HostProcess(subprocess.Popen[bytes]):
                 self.wake()
 
     def wake(self) -> None:
-        """Let nsenter go on: it stops itself when the program is stopped, and would not see its end."""
+        """Continue nsenter: it stops itself when the program is stopped, and would not see its end."""
         with contextlib.suppress(ProcessLookupError):
             os.kill(self.pid, signal.SIGCONT)
 
@@ -87,11 +87,11 @@ class Host:
 
     @property
     def interfaces(self) -> tuple[str, ...]:
-        """Names of the interfaces beside lo."""
+        """Names of the interfaces besides lo."""
         return tuple(self._addresses)
 
     def address(self, interface: str | None = None, family: int = 4) -> str:
-        """The address of an interface (default: the first), of family 4 or 6.
+        """Return the address of an interface (default: the first), of family 4 or 6.
 
         Raises:
             LabError: no such interface or family.
@@ -102,7 +102,7 @@ class Host:
             raise LabError(f"{self.name}: no IPv{family} address on {interface}") from None
 
     def enter_command(self, cwd: str | os.PathLike[str] | None = None) -> list[str]:
-        """The command that runs what is appended to it on this host."""
+        """Return a command prefix that runs the command appended to it on this host."""
         target = str(self.anchor_pid)
         command = ["nsenter", "--target", target, "--mount", "--uts", "--ipc", "--net", "--pid"]
         if self._user_namespace:
@@ -125,12 +125,12 @@ class Host:
 
         Args:
             argv: program and arguments, looked up in the caller's PATH and file system.
-            env: on top of the caller's environment and `environment`; None as a value removes the name.
-            cwd: default: the caller's.
+            env: added to the caller's environment and `environment`; a value of None removes the name.
+            cwd: working directory; default: the caller's.
             log_path: append stdout and stderr there; excludes `stdout` and `stderr`.
             stdin, stdout, stderr: as for `subprocess.Popen`; stdin defaults to /dev/null.
-            new_session: keep a Ctrl-C at the terminal from it, so that the caller decides the order of
-                the ends; False for an interactive program.
+            new_session: shield it from a Ctrl-C at the terminal, so that the caller decides in which order
+                programs end; False for an interactive program.
         """
         merged: dict[str, str] = {**os.environ, **self.environment}
         for key, value in (env or {}).items():
@@ -175,8 +175,8 @@ class Host:
         """Run a program to its end and capture its output.
 
         Raises:
-            subprocess.TimeoutExpired: not ended after `timeout` seconds; it has been killed.
-            subprocess.CalledProcessError: with `check`, an exit code other than 0.
+            subprocess.TimeoutExpired: it did not end within `timeout` seconds, and was killed.
+            subprocess.CalledProcessError: with `check`, its exit code is not 0.
         """
         process = self.popen(
             argv,
@@ -209,7 +209,7 @@ class Host:
         *,
         device: str | None = None,
     ) -> socket.socket:
-        """A socket of this host in the caller's own hands: what is sent on it leaves from here.
+        """Return a socket of this host for use in the caller's process: what it sends leaves from this host.
 
         Args:
             family, kind: as for `socket.socket`.
@@ -221,17 +221,17 @@ class Host:
         return self._open_socket(family, kind, device)
 
     def kill(self, process: HostProcess, sig: int = signal.SIGKILL, *, timeout: float = 10.0) -> int:
-        """Signal a program and wait for its end; its return code. Raises subprocess.TimeoutExpired."""
+        """Signal a program, wait for its end and return its return code; raises subprocess.TimeoutExpired."""
         process.send_signal(sig)
         return process.wait(timeout)
 
     def link_down(self, interface: str) -> None:
-        """`ip link set INTERFACE down`: its routes go, sockets bound to it fail."""
+        """Run `ip link set INTERFACE down`: its routes vanish, sockets bound to it fail."""
         self.address(interface)
         self.ip_batch([f"link set {interface} down"])
 
     def link_up(self, interface: str) -> None:
-        """Bring it up again, with the addresses, routes and neighbours it had at the start."""
+        """Bring an interface up again, with the addresses, routes and neighbours that it had at the start."""
         self.address(interface)
         self.ip_batch(self._interface_lines[interface])
 
@@ -239,14 +239,14 @@ class Host:
         """Run commands of `ip` (without the word `ip`) on this host.
 
         Raises:
-            LabError: one of them failed; the text says why.
+            LabError: a command failed; the text says why.
         """
         done = self.run(["ip", "-batch", "-"], input="\n".join(lines) + "\n")
         if done.returncode:
             raise LabError(f"{self.name}: {done.stderr.strip()}")
 
     def wake(self) -> None:
-        """Let the waiting nsenters of stopped programs see the end that comes; for `Lab.close`."""
+        """Continue the nsenters of stopped programs, so that they see the coming end; for `Lab.close`."""
         for process in self._processes:
             if process.poll() is None:
                 process.wake()
@@ -262,7 +262,7 @@ class Host:
 
 
 def children_of(pid: int) -> list[int]:
-    """PIDs of a process's children; empty if it has none or is gone."""
+    """Return the PIDs of a process's children; empty if it has none or is gone."""
     try:
         return [int(word) for word in Path(f"/proc/{pid}/task/{pid}/children").read_text().split()]
     except (FileNotFoundError, ProcessLookupError):

@@ -1,4 +1,4 @@
-"""The few Linux calls that Python 3.11 has no wrapper for: namespaces, mounts, prctl, TAP devices."""
+"""Wraps the few Linux calls that Python 3.11 has no wrapper for: namespaces, mounts, prctl, TAP devices."""
 
 from __future__ import annotations
 
@@ -45,12 +45,12 @@ def _check(result: int, what: str) -> None:
 
 
 def unshare(flags: int) -> None:
-    """unshare(2). Raises OSError."""
+    """Call unshare(2); raises OSError."""
     _check(_libc.unshare(flags), "unshare")
 
 
 def mount(source: str, target: str, kind: str | None, flags: int = 0, options: str = "") -> None:
-    """mount(2). Raises OSError."""
+    """Call mount(2); raises OSError."""
     result = _libc.mount(
         source.encode(),
         target.encode(),
@@ -67,13 +67,13 @@ def set_process_name(name: str) -> None:
 
 
 def set_timer_slack(nanoseconds: int) -> None:
-    """How late, on purpose, the kernel may wake this thread; 50 000 by default."""
+    """Set how late the kernel may wake this thread on purpose; the default is 50 000."""
     _libc.prctl(_PR_SET_TIMERSLACK, ctypes.c_ulong(nanoseconds), 0, 0, 0)
 
 
 @contextlib.contextmanager
 def network_namespace_of(pid: int) -> Iterator[None]:
-    """Be in the network namespace of process `pid` for a while. Raises OSError."""
+    """Enter the network namespace of process `pid` within the block; raises OSError."""
     home = os.open("/proc/thread-self/ns/net", os.O_RDONLY | os.O_CLOEXEC)
     try:
         there = os.open(f"/proc/{pid}/ns/net", os.O_RDONLY | os.O_CLOEXEC)
@@ -90,7 +90,7 @@ def network_namespace_of(pid: int) -> Iterator[None]:
 
 
 def can_administer() -> bool:
-    """Whether this process may make namespaces without a user namespace of its own."""
+    """Return whether this process may make namespaces without a user namespace of its own."""
     with open("/proc/self/status") as status:
         for line in status:
             if line.startswith("CapEff:"):
@@ -115,7 +115,7 @@ def set_tap_carrier(descriptor: int, *, on: bool) -> None:
 
 
 def set_interface_up(name: str, *, on: bool) -> None:
-    """`ip link set NAME up|down` in the current network namespace. Raises OSError."""
+    """Do `ip link set NAME up|down` in the current network namespace; raises OSError."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as any_socket:
         request = struct.pack("16sH22x", name.encode(), 0)
         (flags,) = struct.unpack_from("H", fcntl.ioctl(any_socket, _SIOCGIFFLAGS, request), 16)
@@ -124,7 +124,7 @@ def set_interface_up(name: str, *, on: bool) -> None:
 
 
 def disable_offloads(name: str) -> None:
-    """Make the kernel fill in checksums and cut segments before frames leave `name`. Raises OSError."""
+    """Make the kernel fill in checksums and cut segments before frames leave `name`; raises OSError."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as any_socket:
         for command in (_ETHTOOL_STXCSUM, _ETHTOOL_STSO):
             value = ctypes.create_string_buffer(struct.pack("II", command, 0))

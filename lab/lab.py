@@ -1,4 +1,4 @@
-"""Bring the lab up, hand out its hosts, links and routers, take it down."""
+"""Brings the lab up, hands out its hosts, links and routers, and takes it down."""
 
 from __future__ import annotations
 
@@ -37,9 +37,9 @@ if TYPE_CHECKING:
 _REPOSITORY = Path(__file__).resolve().parents[1]
 # Building takes half a second on an idle machine.
 _BUILD_TIMEOUT_S = 60.0
-# SIGKILL takes effect at once; taking down the namespaces' processes some tens of ms.
+# SIGKILL takes effect at once; taking down the namespaces' processes takes some tens of ms.
 _END_TIMEOUT_S = 20.0
-# Of the lab's own processes; they write when something goes wrong.
+# Log limit of the lab's own processes, which write only when something goes wrong.
 _MAX_LOG_BYTES = 1 << 16
 _NEEDED_PROGRAMS = ("ip", "nft", "nsenter", "setpriv", "unshare")
 _Part = TypeVar("_Part")
@@ -50,7 +50,7 @@ class Nat:
 
     def __init__(self, spec: NatSpec, router: Host, lab: Lab) -> None:
         self.router = router
-        """The router itself: run `nft`, `tcpdump` there."""
+        """The router itself, on which `nft` and `tcpdump` can be run."""
         self._spec = spec
         self._lab = lab
         self._rebindings = 0
@@ -61,7 +61,7 @@ class Nat:
         return self.router.address("wan0", 4)
 
     def rebind(self) -> None:
-        """Forget every mapping, as a carrier does now and then: each flow's next packet gets another port.
+        """Forget every mapping, as a carrier does at times: each flow's next packet gets another port.
 
         Answers to the old port are lost from now on. For IPv6, which is not translated, the firewall
         forgets its flows: nothing comes in until the host sends again.
@@ -75,7 +75,7 @@ class Nat:
 
 
 class Lab:
-    """The lab, as a context manager. The package's docstring tells how to use it.
+    """The lab, as a context manager. The package's docstring shows how to use it.
 
     Raises:
         LabError: a program is missing, or the kernel refused something; the text says what.
@@ -91,8 +91,8 @@ class Lab:
         self._holder: subprocess.Popen[bytes] | None = None
         self._inner_pids: dict[str, int] = {}
         self._lifeline: LineSocket | None = None
-        # The kernel sends the parent-death signal when the *thread* that started a process ends: all are
-        # started from one thread that lives as long as the lab.
+        # The kernel sends the parent-death signal when the *thread* that started a process ends. So all are started
+        # from one thread that lives as long as the lab.
         self._spawner = ThreadPoolExecutor(1, "netlab-spawner")
         self._log: IO[bytes] | None = None
         self._lifeline_lock = threading.Lock()
@@ -123,18 +123,18 @@ class Lab:
         return dict(self._links)
 
     def host(self, name: str) -> Host:
-        """A host, or any other machine (`internet`, `robot-wlan0-nat`). Raises LabError if there is none."""
+        """Return a host or other machine (`internet`, `robot-wlan0-nat`); raises LabError if there is none."""
         try:
             return self._machines[name]
         except KeyError:
             raise LabError(f"no machine {name!r}, only {', '.join(self._machines)}") from None
 
     def link(self, interface: str, *, host: str | None = None) -> Link:
-        """The emulated link of an interface; name the host if several have such an interface."""
+        """Return the emulated link of an interface; name the host if several have such an interface."""
         return _find(self._links, interface, host, "emulated link")
 
     def nat(self, interface: str, *, host: str | None = None) -> Nat:
-        """The NAT router of an interface; name the host if several have such an interface."""
+        """Return the NAT router of an interface; name the host if several have such an interface."""
         return _find(self._nats, interface, host, "NAT router")
 
     def replay(
@@ -146,7 +146,7 @@ class Lab:
         start: float | None = None,
         repeat: bool = False,
     ) -> float:
-        """Replay a trace on several links on one clock: `paths` maps interface -> path of the trace.
+        """Replay a trace on several links with one clock; `paths` maps interface -> path of the trace.
 
         Returns the `time.monotonic()` of the trace's second 0 (default: `REPLAY_LEAD_S` from now).
         """
@@ -156,11 +156,11 @@ class Lab:
         return start
 
     def drawing(self) -> str:
-        """The topology with its addresses, as text."""
+        """Return the topology with its addresses, as text."""
         return draw(self.config, self._plan)
 
     def close(self) -> None:
-        """End every process of the lab, at once, and so the lab; harmless when repeated."""
+        """End every process of the lab at once, and so the lab; may be called again."""
         if self._holder is not None:
             for holder in children_of(self._holder.pid):
                 with contextlib.suppress(ProcessLookupError):
@@ -171,7 +171,7 @@ class Lab:
         for machine in self._machines.values():
             machine.wake()
         if self._holder is not None:
-            # unshare ends as its child does, which the kernel reports only when all the lab is dead.
+            # unshare ends when its child does, which the kernel reports only once the whole lab is dead.
             try:
                 self._holder.wait(_END_TIMEOUT_S)
             except subprocess.TimeoutExpired:
@@ -288,7 +288,7 @@ def _start_holder(end: socket.socket, log: IO[bytes], *, user_namespace: bool) -
     if user_namespace:
         command += ["--user", "--map-root-user"]
     return subprocess.Popen(
-        # -S: the standard library is all it needs, and a venv's start-up hooks may be slow.
+        # -S: it needs only the standard library, and a venv's start-up hooks may be slow.
         [*DIE_WITH_PARENT, *command, sys.executable, "-S", "-m", "lab.holder", str(end.fileno())],
         pass_fds=[end.fileno()],
         env={**os.environ, "PYTHONPATH": str(_REPOSITORY)},
@@ -300,7 +300,7 @@ def _start_holder(end: socket.socket, log: IO[bytes], *, user_namespace: bool) -
 
 
 def _outer_pids(unshare_pid: int) -> dict[int, int]:
-    """PID inside the lab -> PID outside, of the holder's children."""
+    """Map the PIDs of the holder's children inside the lab to those outside."""
     (holder,) = children_of(unshare_pid)
     pids = {}
     for outer in children_of(holder):

@@ -1,4 +1,4 @@
-"""A histogram of how late something happened, cheap enough to keep per packet."""
+"""Keeps a histogram of how late something happened, cheap enough to update per packet."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ class LatenessHistogram:
             self.max_s = seconds
 
     def quantile(self, q: float) -> float:
-        """Upper bound, in seconds, of the bucket that holds the `q` quantile; 0 if nothing was recorded."""
+        """Return the upper bound, in seconds, of the bucket with the `q` quantile; 0 if nothing was recorded."""
         if self.count == 0:
             return 0.0
         rank = max(1, min(self.count, round(q * self.count)))
@@ -51,7 +51,7 @@ class LatenessHistogram:
         return self.max_s
 
     def to_json(self) -> dict[str, Any]:
-        """count, p50_s, p99_s, max_s."""
+        """Return count, p50_s, p99_s, max_s."""
         return {
             "count": self.count,
             "p50_s": self.quantile(0.5),

@@ -1,4 +1,4 @@
-"""A running emulated link, seen from outside: change it, darken it, replay a trace on it, question it."""
+"""Controls a running emulated link: changes it, darkens it, replays a trace on it, reads its counters."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ if TYPE_CHECKING:
     from lab.traces import Trace
     from lab.wire import LineSocket
 
-# A trace of an hour takes the emulator well under a second to swallow.
+# The emulator reads an hour's trace in well under a second.
 _ANSWER_TIMEOUT_S = 20.0
-# By then every link has its steps, so that the first ones are in time too, seconds.
+# Seconds before a replay starts: every link has its steps by then, so that even the first ones are on time.
 REPLAY_LEAD_S = 0.5
 
 
 @dataclass(frozen=True, slots=True)
 class DirectionStats:
-    """Counters of one direction since the lab began. Bytes are those of IP packets."""
+    """Counters of one direction since the lab began. Bytes count IP packets."""
 
     sent_packets: int
     sent_bytes: int
@@ -32,15 +32,15 @@ class DirectionStats:
     delivered_bytes: int
     drops: dict[DropReason, int]
     queue_bytes: int
-    """In front of the bottleneck now."""
+    """Bytes in front of the bottleneck now."""
     in_flight_packets: int
-    """Past the bottleneck, not yet delivered."""
+    """Packets past the bottleneck that are not yet delivered."""
     bypassed_packets: int
     """Multicast and broadcast frames of the kernels (ARP, MLD), let through unemulated."""
     kernel_drops: int
-    """Lost before the emulator could read them: anything but 0 says that the emulator was too slow."""
+    """Frames lost before the emulator could read them: anything but 0 means that the emulator was too slow."""
     profile: LinkProfile
-    """In force now."""
+    """Profile in force now."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,31 +55,31 @@ class Lateness:
 
 @dataclass(frozen=True, slots=True)
 class LinkStats:
-    """What the link did, and how far to trust it."""
+    """What the link did, and how far to trust its figures."""
 
     up: DirectionStats
     """Host to internet."""
     down: DirectionStats
     """Internet to host."""
     dark: DropReason | None
-    """BLACKHOLE or UNPLUGGED while it is so."""
+    """BLACKHOLE or UNPLUGGED while the link is dark."""
     replaying: bool
     lateness: Lateness
-    """Of packets behind their computed departure time, since the last reset."""
+    """Lateness of packets against their computed departure times, since the last reset."""
     step_lateness: Lateness
-    """Of trace steps behind their time, since the last reset."""
+    """Lateness of trace steps, since the last reset."""
     turns: int
     """Turns of the emulator's loop."""
     realtime: bool
-    """Whether the emulator goes before ordinary processes (SCHED_RR); if not, mind the lateness."""
+    """Whether the emulator takes precedence over ordinary processes (SCHED_RR); if not, mind the lateness."""
     longest_turn_s: float
-    """A packet that arrived meanwhile waited so long before its arrival was noticed; since the last reset."""
+    """Longest turn since the last reset: a packet that arrived during it was noticed only at its end."""
     cpu_s: float
     """Processor time of the emulator since its start."""
 
 
 class Link:
-    """The emulated link of one interface, made by `Lab`; both directions. Safe to use from any thread."""
+    """Both directions of the emulated link of one interface, made by `Lab`. Safe to use from any thread."""
 
     def __init__(
         self,
@@ -95,7 +95,7 @@ class Link:
         self.interface = interface
         self._control = control
         self._first = (up, down)
-        self._last_words = last_words  # what the lab's processes wrote on stderr
+        self._last_words = last_words  # what the lab's processes wrote to stderr
         self._lock = threading.Lock()
         control.settimeout(_ANSWER_TIMEOUT_S)
 
@@ -113,28 +113,28 @@ class Link:
         self._ask("set", up=_profile_json(up or both), down=_profile_json(down or both))
 
     def change(self, **fields: Any) -> None:
-        """Change single fields of `LinkProfile`, both directions, as `change(loss=0.1)`; ends a replay."""
+        """Change single fields of `LinkProfile` in both directions, as in `change(loss=0.1)`; ends a replay."""
         stats = self.stats()
         self.set(up=replace(stats.up.profile, **fields), down=replace(stats.down.profile, **fields))
 
     def outage(self) -> None:
-        """Rate 0 in both directions: the queues fill, then drop. `change(rate_kbps=...)` ends it."""
+        """Set the rate to 0 in both directions: the queues fill, then drop. `change(rate_kbps=...)` ends it."""
         self.change(rate_kbps=0)
 
     def blackhole(self) -> None:
-        """Lose everything silently, what is under way included; the carrier stays up."""
+        """Lose everything silently, including packets under way; the carrier stays up."""
         self._ask("dark", reason=DropReason.BLACKHOLE)
 
     def unplug(self) -> None:
-        """Pull the cable: as `blackhole`, and the interface loses its carrier."""
+        """Pull the cable: like `blackhole`, and the interface loses its carrier."""
         self._ask("dark", reason=DropReason.UNPLUGGED)
 
     def restore(self) -> None:
-        """End `blackhole` or `unplug`; profile or replay go on as if nothing had been."""
+        """End `blackhole` or `unplug`; profile or replay continue as if nothing had happened."""
         self._ask("dark", reason=None)
 
     def reset(self) -> None:
-        """Back to the profiles the lab began with, neither dark nor replaying."""
+        """Return to the profiles that the lab began with, neither dark nor replaying."""
         self.set(up=self._first[0], down=self._first[1])
         self.restore()
 
@@ -143,7 +143,7 @@ class Link:
 
         Args:
             start: `time.monotonic()` of the trace's second 0; default: `REPLAY_LEAD_S` from now.
-            repeat: begin anew at the end instead of keeping the last step.
+            repeat: start over at the end instead of keeping the last step.
 
         Raises:
             LabConfigError: the trace has no such path.
@@ -156,7 +156,7 @@ class Link:
         )
 
     def stats(self, *, reset: bool = False) -> LinkStats:
-        """Counters and lateness; `reset` begins the lateness (not the counters) anew."""
+        """Return counters and lateness; `reset` restarts the lateness (not the counters)."""
         answer = self._ask("stats", reset=reset)
         return LinkStats(
             up=_direction_stats(answer["up"]),

@@ -1,4 +1,4 @@
-"""One direction of an emulated link, without IO: which packets survive, and when they leave.
+"""Models one direction of an emulated link, without IO: which packets survive, and when they leave.
 
     send ──▶ loss ──▶ byte queue ──▶ bottleneck (rate) ──▶ propagation (delay + jitter) ──▶ pop_due
               │           │ full: newest dropped
@@ -6,8 +6,8 @@
             counters by DropReason
 
 The loss is drawn as the packet is sent, so a lost packet takes no room and no air time. Two draws
-are made for every packet, needed or not: the fate of the n-th packet depends on the seed and the
-profile in force alone, never on the draws of earlier profiles.
+are made for every packet, needed or not: the fate of the n-th packet depends only on the seed and the
+profile in force, never on the draws of earlier profiles.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from lab.profile import DropReason, LinkProfile
 if TYPE_CHECKING:
     from random import Random
 
-# Packets in propagation that one direction stores; ~150 MB at the usual MTU, 1 s at 100 kpps.
+# Most packets in propagation that one direction stores; ~150 MB at the usual MTU, 1 s at 100 kpps.
 MAX_IN_FLIGHT_PACKETS = 100_000
 
 
@@ -36,8 +36,8 @@ class LinkModel:
         self._rng = rng
         self._queue: deque[tuple[bytes, int, float]] = deque()  # packet, size, its draw for the jitter
         self._queue_bytes = 0
-        self._head_bits = 0.0  # of the queue's head, still to be serialised
-        self._head_since = now  # since when the bottleneck works on those bits
+        self._head_bits = 0.0  # bits of the queue's head still to be serialised
+        self._head_since = now  # when the bottleneck began with those bits
         self._in_flight: deque[tuple[float, bytes, int]] = deque()  # departure, packet, size
         self._last_due = now
         self._dark: DropReason | None = None
@@ -50,12 +50,12 @@ class LinkModel:
 
     @property
     def queue_bytes(self) -> int:
-        """Bytes in front of the bottleneck as of the last call that took the time."""
+        """Bytes in front of the bottleneck at the last call with a time."""
         return self._queue_bytes
 
     @property
     def in_flight_packets(self) -> int:
-        """Packets that passed the bottleneck and have not left."""
+        """Packets that have passed the bottleneck but not left."""
         return len(self._in_flight)
 
     def send(self, now: float, packet: bytes, size: int) -> None:
@@ -85,7 +85,7 @@ class LinkModel:
         self._queue_bytes += size
 
     def next_departure(self) -> float | None:
-        """When `pop_due` will next have a packet, if nothing else happens; None: never."""
+        """Return when `pop_due` will next have a packet, if nothing else happens; None if never."""
         if self._in_flight:
             return self._in_flight[0][0]
         if self._queue and self._bits_per_s:
@@ -95,7 +95,7 @@ class LinkModel:
         return None
 
     def pop_due(self, now: float) -> list[tuple[float, bytes]]:
-        """(departure time, packet) of every packet due by `now`, in the order they were sent."""
+        """Return (departure time, packet) of every packet due by `now`, in the order they were sent."""
         if self._queue:
             self._advance(now)
         in_flight = self._in_flight
@@ -108,7 +108,7 @@ class LinkModel:
         return due
 
     def set_profile(self, now: float, profile: LinkProfile) -> None:
-        """Change the link under way; packets already past the bottleneck keep their departure times.
+        """Change the profile; packets already past the bottleneck keep their departure times.
 
         A queue longer than the new `queue_bytes` keeps its packets and takes no more.
         """
@@ -123,7 +123,7 @@ class LinkModel:
                 self._leave_queue(now)
 
     def set_dark(self, now: float, reason: DropReason | None) -> None:
-        """Lose everything from `now` on, what is queued or in flight included, until set to None."""
+        """Lose everything from `now` on, including packets queued or in flight, until set to None."""
         self._advance(now)
         self._dark = reason
         if reason is not None:
@@ -134,7 +134,7 @@ class LinkModel:
             self._last_due = now
 
     def count_undeliverable(self, packet_bytes: int) -> None:
-        """A packet that `pop_due` gave out could not be handed to the receiving interface after all."""
+        """Count a packet from `pop_due` that could not be handed to the receiving interface after all."""
         self.delivered_packets -= 1
         self.delivered_bytes -= packet_bytes
         self.drops[DropReason.INTERFACE_DOWN] += 1

@@ -1,6 +1,6 @@
-"""From the topology to what must be built: namespaces, segments between them, addresses, routes, rules.
+"""Derives what must be built from the topology: namespaces, segments between them, addresses, routes, rules.
 
-Addresses. Interface k (counted over all hosts, from 1) has the networks
+Addresses: interface k (counted over all hosts, from 1) has the networks
 
     behind its NAT     192.168.k.0/24   fd00:168:0:k::/64   router .1 / ::1, host .2 / ::2
     to the internet    198.18.k.0/24    fd00:18:0:k::/64    core   .1 / ::1, router or host .2 / ::2
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from lab.topology import HostSpec, InterfaceSpec, LabConfig
 
 CORE = "internet"
-# Between the metrics of two default routes, so that an experiment can slip one in.
+# Distance between the metrics of two default routes, so that an experiment can insert one.
 _METRIC_STEP = 100
 _FIRST_SOURCE_TABLE = 1000
 
@@ -31,12 +31,12 @@ _COMMON_SYSCTLS = {
     "net/ipv6/conf/default/disable_ipv6": "0",
     "net/ipv6/conf/default/accept_ra": "0",
     "net/ipv6/conf/default/autoconf": "0",
-    # Addresses are usable at once: no wait for duplicate address detection.
+    # Addresses are usable at once, without duplicate address detection.
     "net/ipv6/conf/all/accept_dad": "0",
     "net/ipv6/conf/default/accept_dad": "0",
 }
 _FORWARDING_SYSCTLS = {"net/ipv4/ip_forward": "1", "net/ipv6/conf/all/forwarding": "1"}
-# Loopback as a desktop has it, plus multicast: DDS discovers its peers on one host by it.
+# Loopback as on a desktop, plus multicast, by which DDS discovers peers on the same host.
 _LOOPBACK = ("link set lo up multicast on",)
 
 
@@ -57,7 +57,7 @@ class Segment:
     outer: End
     mtu: int
     link: int | None = None
-    """Index into `Plan.links`; None: a plain cable."""
+    """Index into `Plan.links`; None for a plain cable."""
 
 
 @dataclass(slots=True)
@@ -69,15 +69,15 @@ class Namespace:
     sysctls: dict[str, str]
     ip_lines: list[str] = field(default_factory=list)
     ip6_rules: list[str] = field(default_factory=list)
-    """Commands of `ip -6 -batch`: a rule does not tell its family."""
+    """Commands of `ip -6 -batch`, since a rule does not name its family."""
     interface_lines: dict[str, list[str]] = field(default_factory=dict)
-    """Interface -> the commands that address and route it, to be given again after it was down."""
+    """Interface -> the commands that address and route it, to be repeated after it was down."""
     nft_rules: str = ""
 
 
 @dataclass(frozen=True, slots=True)
 class LinkPlan:
-    """An emulated link: whose interface, its first profiles as JSON, its seed."""
+    """An emulated link: the owner of its interface, its first profiles as JSON, its seed."""
 
     host: str
     interface: str
@@ -88,7 +88,7 @@ class LinkPlan:
 
 @dataclass(slots=True)
 class Plan:
-    """All there is to build. Goes to the holder as JSON."""
+    """Everything to build; sent to the holder as JSON."""
 
     namespaces: dict[str, Namespace] = field(default_factory=dict)
     segments: list[Segment] = field(default_factory=list)
@@ -101,7 +101,7 @@ class Plan:
     ports: str = "auto"
 
     def to_json(self) -> dict[str, Any]:
-        """Ready for JSON."""
+        """Return the plan in a form ready for JSON."""
         return {
             "namespaces": {name: asdict(namespace) for name, namespace in self.namespaces.items()},
             "segments": [asdict(segment) for segment in self.segments],
@@ -112,7 +112,7 @@ class Plan:
 
 
 def make_plan(config: LabConfig, seed: int) -> Plan:
-    """Lay out the whole lab; pure."""
+    """Lay out the whole lab; a pure function."""
     plan = Plan(ports=config.ports)
     core = Namespace(CORE, False, {**_COMMON_SYSCTLS, **_FORWARDING_SYSCTLS}, list(_LOOPBACK))
     plan.namespaces[CORE] = core
@@ -187,7 +187,7 @@ def _plan_interface(
 
 
 def _address(plan: Plan, end: End, peer: End, addresses: dict[int, str], own_number: int) -> None:
-    """Address `end`, and tell it its neighbour: no ARP has to cross a lossy link."""
+    """Give `end` its address and a fixed neighbour, so that no ARP has to cross a lossy link."""
     plan.addresses.setdefault(end.namespace, {})[end.interface] = addresses
     lines = plan.namespaces[end.namespace].interface_lines.setdefault(end.interface, [])
     lines += [

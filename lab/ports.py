@@ -1,8 +1,8 @@
-"""Where the emulator gets its frames: a TAP device, or a packet socket on one end of a veth pair.
+"""Gives the emulator its frames: from a TAP device, or a packet socket on one end of a veth pair.
 
 The interface that the host sees has the same name, address and behaviour either way. TAP is the
-first choice; the packet socket serves where /dev/net/tun is not ours to open (unprivileged, in
-many containers).
+first choice; the packet socket serves where we may not open /dev/net/tun (unprivileged, in many
+containers).
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from typing import Protocol
 
 from lab import kernel
 
-# Longest frame: Ethernet header and a jumbo packet.
+# Longest frame: an Ethernet header and a jumbo packet.
 MAX_FRAME_BYTES = 9216
 # linux/if_packet.h
 _SOL_PACKET = 263
@@ -33,13 +33,13 @@ class Port(Protocol):
     """One end of the link."""
 
     def fileno(self) -> int:
-        """Readable when a frame waits."""
+        """Return a descriptor that is readable when a frame waits."""
 
     def read(self) -> bytes | None:
-        """The next Ethernet frame the host sent; None: none waits."""
+        """Return the next Ethernet frame that the host sent; None if none waits."""
 
     def write(self, frame: bytes) -> bool:
-        """Hand the host an Ethernet frame; False: its interface is down."""
+        """Hand the host an Ethernet frame; return False if its interface is down."""
 
     def set_carrier(self, *, on: bool) -> None:
         """Plug or unplug the cable, as the host sees it."""
@@ -54,7 +54,7 @@ class TapPort:
     def __init__(self, name: str) -> None:
         self._name = name
         self._fd = kernel.open_tap(name)
-        # Opened here and kept, so that it goes on telling about this namespace.
+        # Opened here and kept open, so that it keeps showing this namespace.
         self._counters = os.open("/proc/thread-self/net/dev", os.O_RDONLY | os.O_CLOEXEC)
 
     def fileno(self) -> int:
@@ -89,7 +89,7 @@ class TapPort:
         for line in os.pread(self._counters, 1 << 16, 0).decode().splitlines():
             name, colon, counters = line.partition(":")
             if colon and name.strip() == self._name:
-                return int(counters.split()[11])  # 8 receive columns, then bytes packets errs drop
+                return int(counters.split()[11])  # 8 receive columns, then bytes, packets, errs, drop
         return 0
 
 

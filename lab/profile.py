@@ -1,4 +1,4 @@
-"""What one direction of a link does to packets, as data."""
+"""Describes what one direction of a link does to packets, as data."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ class DropReason(StrEnum):
     """Why the emulator lost a packet; each has its own counter."""
 
     LOSS = "loss"
-    """Drawn at random, with probability ``LinkProfile.loss``."""
+    """Lost at random, with probability ``LinkProfile.loss``."""
     QUEUE_FULL = "queue_full"
     """The bottleneck's byte queue had no room (newest packet dropped); also during an outage."""
     BLACKHOLE = "blackhole"
@@ -28,7 +28,7 @@ class DropReason(StrEnum):
     IN_FLIGHT_FULL = "in_flight_full"
     """More packets in flight than the emulator stores: the scenario is beyond this lab."""
     INTERFACE_DOWN = "interface_down"
-    """The receiving interface refused the packet, being down (with packet ports: noticed some ms late)."""
+    """The receiving interface was down and refused the packet (with packet ports this is noticed some ms late)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,22 +37,22 @@ class LinkProfile:
 
     A packet is lost with probability `loss` as it is sent. Survivors pass a first-in-first-out
     bottleneck of `rate_kbps` with `queue_bytes` of room, then propagate for `delay_ms` plus a draw,
-    uniform in 0..`jitter_ms`. No packet ever overtakes another: the order wins over the jitter.
+    uniform in 0..`jitter_ms`. No packet ever overtakes another: order takes precedence over jitter.
 
     Raises:
-        LabConfigError: a field out of its range.
+        LabConfigError: a field is out of range.
     """
 
     delay_ms: float = 0.0
-    """Propagation, one way, milliseconds; >= 0."""
+    """One-way propagation delay in milliseconds; >= 0."""
     jitter_ms: float = 0.0
-    """Upper end of the extra propagation, milliseconds; >= 0. Never shortens `delay_ms`."""
+    """Upper bound of the extra delay in milliseconds; >= 0. Never shortens `delay_ms`."""
     loss: float = 0.0
     """Probability that a packet is lost, 0..1."""
     rate_kbps: float | None = None
-    """Bottleneck rate in kilobit/s of IP packets; None: unlimited; 0: outage, the queue fills, then drops."""
+    """Bottleneck rate in kilobit/s of IP packets; None is unlimited; 0 is an outage: the queue fills, then drops."""
     queue_bytes: int = DEFAULT_QUEUE_BYTES
-    """Room in front of the bottleneck, bytes of IP packets, the one being sent included."""
+    """Queue in front of the bottleneck in bytes of IP packets, including the one being sent."""
 
     def __post_init__(self) -> None:
         for name, value in (("delay_ms", self.delay_ms), ("jitter_ms", self.jitter_ms)):
@@ -66,15 +66,15 @@ class LinkProfile:
             raise LabConfigError(f"queue_bytes: expected >= 0, got {self.queue_bytes!r}")
 
     def to_json(self) -> dict[str, Any]:
-        """Field name -> value, ready for JSON."""
+        """Return field name -> value, ready for JSON."""
         return asdict(self)
 
     @classmethod
     def from_json(cls, fields: Mapping[str, Any]) -> LinkProfile:
-        """The inverse of `to_json`.
+        """Return the profile that `to_json` encoded.
 
         Raises:
-            LabConfigError: unknown field, wrong type or value out of range.
+            LabConfigError: a field is unknown, has the wrong type or a value out of range.
         """
         try:
             return cls(**fields)

@@ -1,4 +1,4 @@
-"""When which step of a trace applies, without IO."""
+"""Decides when each step of a trace applies, without IO."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ if TYPE_CHECKING:
 
 
 class Replay:
-    """Steps of a trace laid on the monotonic clock, once or for ever.
+    """Steps of a trace laid on the monotonic clock, once or repeatedly.
 
     Args:
         steps: in order of time, the first at 0.
-        start: the monotonic second at which the trace's clock reads 0. If it has passed, the steps
-            missed are passed over and the one in force applies.
-        repeat_s: begin anew after so many seconds (the trace's duration); None: keep the last step.
+        start: the monotonic second at which the trace's clock reads 0. If it has passed, missed steps
+            are skipped and the one in force applies.
+        repeat_s: start over after this many seconds (the trace's duration); None keeps the last step.
 
     Raises:
         LabConfigError: no steps, or `repeat_s` not beyond the last step.
@@ -34,13 +34,13 @@ class Replay:
         self._next = 0
 
     def next_change(self) -> float | None:
-        """The monotonic second of the next step; None: the last one is in force."""
+        """Return the monotonic second of the next step; None if the last one is in force."""
         if self._next == len(self._steps):
             return None
         return self._start + self._steps[self._next].at_s
 
     def due(self, now: float) -> list[tuple[float, TraceStep]]:
-        """(time it was due, step) for the newest step due by `now` and not yet given out; or nothing."""
+        """Return (time it was due, step) for the newest step due by `now` and not yet returned; or nothing."""
         newest: list[tuple[float, TraceStep]] = []
         while (at := self.next_change()) is not None and at <= now:
             newest = [(at, self._steps[self._next])]

@@ -1,4 +1,4 @@
-"""The NAT router: nftables rules, and forgetting its mappings."""
+"""Configures the NAT router: its nftables rules, and forgetting its mappings."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ if TYPE_CHECKING:
     from lab.topology import NatSpec
 
 # Source ports of the n-th rebinding: disjoint from those of the rebindings before and after it, and
-# above Linux's ephemeral ports (32768..60999), as a port that is in the range already would be kept.
+# above Linux's ephemeral ports (32768..60999), since a port already in the range would be kept.
 _REBIND_FIRST_PORT = 61_000
 _REBIND_PORTS = 500
 _REBIND_RANGES = 9
@@ -38,7 +38,7 @@ table inet firewall {
 
 
 def router_sysctls(nat: NatSpec) -> dict[str, str]:
-    """Kernel settings of this router beside forwarding."""
+    """Return the kernel settings of this router besides forwarding."""
     if nat.udp_timeout_s is None:
         return {}
     timeout = str(nat.udp_timeout_s)
@@ -49,12 +49,12 @@ def router_sysctls(nat: NatSpec) -> dict[str, str]:
 
 
 def router_rules(nat: NatSpec) -> str:
-    """The router's whole rule set, for `nft -f -`."""
+    """Return the router's whole rule set, for `nft -f -`."""
     return _FILTER_RULES + translation_rules(nat, rebindings=0)
 
 
 def translation_rules(nat: NatSpec, *, rebindings: int) -> str:
-    """The address translation after so many rebindings; replaces the one in force in one transaction."""
+    """Return the translation rules after this many rebindings; they replace those in force in one transaction."""
     how = "masquerade"
     if rebindings:
         first = _REBIND_FIRST_PORT + (rebindings - 1) % _REBIND_RANGES * _REBIND_PORTS
@@ -75,7 +75,7 @@ table ip translation {{
 
 
 def flush_connection_tracking() -> None:
-    """Forget every connection, and so every mapping, of the current network namespace. Raises OSError."""
+    """Forget every connection, and so every mapping, of the current network namespace; raises OSError."""
     header = struct.pack("=IHHII", 20, _CTNETLINK_DELETE, _NLM_F_REQUEST_ACK, 1, 0)
     with socket.socket(socket.AF_NETLINK, socket.SOCK_RAW, _NETLINK_NETFILTER) as netlink:
         netlink.send(header + struct.pack("=BBH", socket.AF_UNSPEC, 0, 0))

@@ -1,6 +1,6 @@
-"""The whole real system in the network lab: control plane, cloud servers, robots, each a process of its own.
+"""Runs the whole real system in the network lab: control plane, cloud servers, robots, each in its own process.
 
-Used by the demo, the lab tests and the benchmarks. Nothing here is a stand-in: the processes are the installed
+The demo, the lab tests and the benchmarks use it. Nothing here is a stand-in: the processes are the installed
 programs and the unmodified examples.
 """
 
@@ -35,7 +35,7 @@ METRICS_PORT = 9464
 CONTROL_METRICS_PORT = 9465
 METRICS_TIMEOUT_S = 2.0
 READY_TIMEOUT_S = 60.0
-"""Python with rclpy, numpy and OR-Tools on two shared cores takes seconds to start."""
+"""Time limit for a start: Python with rclpy, numpy and OR-Tools on two shared cores takes seconds."""
 
 
 class SystemFailureError(RuntimeError):
@@ -52,21 +52,21 @@ class Part:
     log: Path
 
     def kill(self) -> None:
-        """SIGKILL, as when the power goes."""
+        """Send SIGKILL, as if the power failed."""
         self.host.kill(self.process, signal.SIGKILL)
 
     def terminate(self, timeout_s: float = 20.0) -> int:
-        """SIGTERM; returns the exit code."""
+        """Send SIGTERM and return the exit code."""
         return self.host.kill(self.process, signal.SIGTERM, timeout=timeout_s)
 
     def tail(self, lines: int = 15) -> str:
-        """The end of its log."""
+        """Return the end of its log."""
         return "\n".join(self.log.read_text(errors="replace").splitlines()[-lines:])
 
 
 @dataclass(slots=True)
 class System:
-    """Starts and stops the parts; `folder` takes configurations, state and logs."""
+    """Starts and stops the parts; `folder` holds configurations, state and logs."""
 
     lab: Lab
     folder: Path
@@ -93,7 +93,7 @@ class System:
     def start_cloud(
         self, name: str, services: Sequence[dict[str, Any]], *, module: str = "sidecar", **changes: Any
     ) -> Part:
-        """Start a cloud's sidecar (or what takes its place); `services` as in its configuration."""
+        """Start a cloud's sidecar (or its replacement); `services` as in its configuration."""
         config = {
             "name": name.replace("_", "-"),
             "role": "cloud",
@@ -119,7 +119,7 @@ class System:
         module: str = "sidecar",
         **changes: Any,
     ) -> Part:
-        """Start a robot's sidecar (or what takes its place) in a ROS domain of its host."""
+        """Start a robot's sidecar (or its replacement) in a ROS domain of its host."""
         config = {
             "name": name,
             "role": "robot",
@@ -135,7 +135,7 @@ class System:
         return self._start(f"{name}.sidecar", self.lab.host(host), module, written, domain=domain)
 
     def tls_dir(self, name: str, role: IdentityRole) -> str:
-        """The folder with the certificate of this name, which gets one when it is first asked for."""
+        """Return the folder with the certificate of this name, which is issued at the first call."""
         path = self.folder / f"{name}.tls"
         if name not in self._certified:
             self.authority.write_tls_dir(path, name, role)
@@ -165,7 +165,7 @@ class System:
     # -- waiting and looking --------------------------------------------------------------------------------------
 
     def wait(self, what: str, done: Callable[[], bool], timeout_s: float = READY_TIMEOUT_S) -> None:
-        """Wait until `done`; raises SystemFailureError with the logs' ends when a program died or the time is over."""
+        """Wait until `done`; raises SystemFailureError with the logs' ends if a program dies or the time is over."""
         end = time.monotonic() + timeout_s
         while not done():
             dead = [part for part in self.parts.values() if part.process.poll() not in (None, 0, -signal.SIGKILL)]
@@ -176,7 +176,7 @@ class System:
             time.sleep(0.1)
 
     def metrics(self, host: str, port: int = METRICS_PORT) -> dict[str, float]:
-        """Scrape a program's metrics: series with labels -> value; empty while it does not answer."""
+        """Scrape a program's metrics as series with labels -> value; empty while it does not answer."""
         try:
             with self.lab.host(host).socket(kind=socket.SOCK_STREAM) as connection:
                 connection.settimeout(METRICS_TIMEOUT_S)
@@ -196,7 +196,7 @@ class System:
         return found
 
     def explain(self, robot: str, service: str) -> Explanation:
-        """What `plr explain` says. Raises SystemFailureError."""
+        """Return what `plr explain` says; raises SystemFailureError."""
         host = self.lab.host("control")
         argv = [
             sys.executable,
@@ -223,12 +223,12 @@ class System:
         )
 
     def close(self) -> None:
-        """Ask every program to end, the robots' clients first; kill what does not."""
+        """Ask every program to end, the robots' clients first, and kill those that do not."""
         for part in reversed(list(self.parts.values())):
             if part.process.poll() is None:
                 try:
                     part.terminate(10.0)
-                except Exception:  # a hung program must not keep the lab up
+                except Exception:  # a hung program must not keep the lab alive
                     part.kill()
 
 

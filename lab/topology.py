@@ -1,4 +1,4 @@
-"""The lab's topology as data: which hosts there are, which interfaces, what lies behind each."""
+"""Describes the lab's topology as data: the hosts, their interfaces, and what lies behind each."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ MAX_ROBOT_INTERFACES = 4
 
 @dataclass(frozen=True, slots=True)
 class NatSpec:
-    """A home or carrier router: translates IPv4, filters IPv6, lets nothing in that was not asked for."""
+    """A home or carrier router that translates IPv4, filters IPv6, and lets in nothing unsolicited."""
 
     kind: Literal["port-preserving", "symmetric"] = "port-preserving"
     """port-preserving: one mapping for all destinations, as STUN and hole punching need it (RFC 4787
-    endpoint-independent mapping). symmetric: another random port for every destination."""
+    endpoint-independent mapping). symmetric: a different random port for every destination."""
     udp_timeout_s: int | None = None
-    """Idle seconds after which a UDP mapping is forgotten; None: the kernel's 30 (120 once answered)."""
+    """Idle seconds after which a UDP mapping is forgotten; None means the kernel's 30 (120 once answered)."""
 
     def __post_init__(self) -> None:
         if self.udp_timeout_s is not None and self.udp_timeout_s < 1:
@@ -38,15 +38,15 @@ class InterfaceSpec:
 
     name: str
     emulated: bool = True
-    """Whether an emulated link lies behind it; else a plain cable."""
+    """Whether an emulated link lies behind it, rather than a plain cable."""
     nat: NatSpec | None = field(default_factory=NatSpec)
-    """The router behind the link; None: the interface has a public address."""
+    """The router behind the link; None if the interface has a public address."""
     up: LinkProfile = field(default_factory=LinkProfile)
     """The emulated link's first profile, host to internet."""
     down: LinkProfile = field(default_factory=LinkProfile)
-    """Likewise, internet to host."""
+    """The same, internet to host."""
     mtu: int = 1500
-    """Bytes; of both ends of the first segment."""
+    """MTU in bytes of both ends of the first segment."""
 
     def __post_init__(self) -> None:
         if not _INTERFACE_NAME.fullmatch(self.name) or self.name == "lo":
@@ -71,13 +71,13 @@ class HostSpec:
 
 
 def server(name: str, *, delay_ms: float = 0.0) -> HostSpec:
-    """A host on the internet: one public `eth0` on a plain cable, or `delay_ms` away (each way, emulated)."""
+    """Return a host on the internet: one public `eth0` on a plain cable, or `delay_ms` away (each way, emulated)."""
     far = LinkProfile(delay_ms=delay_ms)
     return HostSpec(name, (InterfaceSpec("eth0", emulated=delay_ms > 0, nat=None, up=far, down=far),))
 
 
 def robot(name: str = "robot", interfaces: tuple[str, ...] = ("wlan0", "wwan0")) -> HostSpec:
-    """A host whose interfaces each have their own emulated link and NAT router."""
+    """Return a host whose interfaces each have their own emulated link and NAT router."""
     return HostSpec(name, tuple(InterfaceSpec(interface) for interface in interfaces))
 
 
@@ -86,17 +86,17 @@ class LabConfig:
     """The whole lab.
 
     Raises:
-        LabConfigError: duplicate names, or more interfaces than the address plan has room for.
+        LabConfigError: names are duplicate, or there are more interfaces than the address plan has room for.
     """
 
     robots: tuple[HostSpec, ...] = field(default_factory=lambda: (robot(),))
     clouds: tuple[HostSpec, ...] = field(default_factory=lambda: (server("cloud_a"), server("cloud_b")))
     control: HostSpec = field(default_factory=lambda: server("control"))
     source_routing: bool = False
-    """Also route by source address, so that a socket bound to an interface's address alone leaves through
+    """Also route by source address, so that a socket bound only to an interface's address leaves through
     that interface. A robot out of the box does not; sockets bound to the device work either way."""
     ports: Literal["auto", "tap", "packet"] = "auto"
-    """How the emulator gets its frames: TAP devices, packet sockets on veth pairs, or what is to be had."""
+    """How the emulator gets its frames: TAP devices, packet sockets on veth pairs, or whichever is available."""
 
     def __post_init__(self) -> None:
         names = [host.name for host in self.hosts]
@@ -112,12 +112,12 @@ class LabConfig:
 
     @property
     def hosts(self) -> tuple[HostSpec, ...]:
-        """Robots, clouds, control host."""
+        """Robots, clouds and the control host."""
         return (*self.robots, *self.clouds, self.control)
 
     @classmethod
     def of(cls, *, interfaces: tuple[str, ...] = ("wlan0", "wwan0"), clouds: int = 2, robots: int = 1) -> LabConfig:
-        """Robots named robot, robot_2, ...; clouds named cloud_a, cloud_b, ...; one control host."""
+        """Return a lab of robots robot, robot_2, ..., clouds cloud_a, cloud_b, ... and one control host."""
         if not 1 <= clouds <= 26:
             raise LabConfigError(f"clouds: expected 1..26, got {clouds}")
         return cls(

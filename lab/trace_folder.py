@@ -1,4 +1,4 @@
-"""A folder of traces: `index.json`, a list of what there is, and beside it `NAME.csv.gz` for each entry."""
+"""Reads a folder of traces: `index.json` lists them, and beside it lies `NAME.csv.gz` for each entry."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from lab.errors import LabConfigError
 from lab.traces import Trace, load_trace
 
 DEFAULT_FOLDER = Path(__file__).resolve().parents[2] / "shared" / "traces"
-"""Beside the project's root."""
+"""Default folder, beside the project's root."""
 INDEX = "index.json"
 KINDS = ("rate", "rtt")
 
@@ -21,22 +21,22 @@ class TraceEntry:
 
     name: str
     kind: str
-    """`rate`: of capacity; `rtt`: of pings, which say nothing of it."""
+    """`rate` for a trace of capacity; `rtt` for one of pings, which say nothing about capacity."""
     paths: tuple[str, str]
-    """Whose networks paths a and b are."""
+    """The networks that paths a and b use."""
     duration_s: float
     file: Path
 
     def load(self) -> Trace:
-        """Read it. Raises LabConfigError."""
+        """Read the trace; raises LabConfigError."""
         return load_trace(self.file)
 
 
 def read_folder(folder: Path) -> list[TraceEntry]:
-    """What the folder holds, in order of name; nothing when it has no index.
+    """Return the folder's traces, in order of name; none if it has no index.
 
     Raises:
-        LabConfigError: the index is not readable; names the entry.
+        LabConfigError: the index is not readable; the text names the entry.
     """
     index = folder / INDEX
     if not index.is_file():

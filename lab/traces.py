@@ -1,4 +1,4 @@
-"""Recorded paths as the lab's links; the format of the files is `controlplane.planning.traces`'."""
+"""Turns recorded paths into steps of the lab's links; `controlplane.planning.traces` defines the file format."""
 
 from __future__ import annotations
 
@@ -16,22 +16,22 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class TraceStep:
-    """From `at_s` (seconds from the trace's start) on, the link is like this."""
+    """The state of the link from `at_s` on, in seconds from the trace's start."""
 
     at_s: float
     up: LinkProfile
     down: LinkProfile
 
     def to_json(self) -> list[Any]:
-        """[at_s, up, down], ready for JSON."""
+        """Return [at_s, up, down], ready for JSON."""
         return [self.at_s, self.up.to_json(), self.down.to_json()]
 
     @classmethod
     def from_json(cls, fields: list[Any]) -> TraceStep:
-        """The inverse of `to_json`.
+        """Return the step that `to_json` encoded.
 
         Raises:
-            LabConfigError: not such a list.
+            LabConfigError: the fields are not such a list.
         """
         try:
             at_s, up, down = fields
@@ -49,12 +49,12 @@ class Trace:
 
     @property
     def duration_s(self) -> float:
-        """When the last step begins, plus the length of the step before it."""
+        """Start of the last step, plus the length of the step before it."""
         times = [step.at_s for step in next(iter(self.paths.values()))]
         return times[-1] + (times[-1] - times[-2] if len(times) > 1 else 1.0)
 
     def path(self, name: str) -> tuple[TraceStep, ...]:
-        """The steps of one path.
+        """Return the steps of one path.
 
         Raises:
             LabConfigError: no such path.
@@ -69,7 +69,7 @@ def load_trace(file: str | Path, *, queue_bytes: int = traces.DEFAULT_QUEUE_BYTE
     """Read a trace file; both paths get a bottleneck queue of `queue_bytes`.
 
     Raises:
-        LabConfigError: unreadable, or not in the format; names file and line.
+        LabConfigError: the file is unreadable, or not in the format; the text names file and line.
     """
     try:
         return _as_links(traces.read_trace(Path(file), queue_bytes=queue_bytes))
@@ -81,7 +81,7 @@ def parse_trace(text: str, *, name: str = "trace", queue_bytes: int = traces.DEF
     """Parse the text of a trace file.
 
     Raises:
-        LabConfigError: not in the format; names the line.
+        LabConfigError: the text is not in the format; the error names the line.
     """
     try:
         return _as_links(traces.parse_trace(text, name=name, queue_bytes=queue_bytes))

@@ -1,4 +1,4 @@
-"""How the lab's processes talk: one JSON object a line over a stream socket they inherit."""
+"""Lets the lab's processes talk: one JSON object a line over an inherited stream socket."""
 
 from __future__ import annotations
 
@@ -21,36 +21,36 @@ class LineSocket:
         self._descriptors: list[int] = []
 
     def fileno(self) -> int:
-        """Readable when more may be received."""
+        """Return a descriptor that is readable when more may be received."""
         return self._socket.fileno()
 
     def settimeout(self, seconds: float | None) -> None:
-        """How long `send` and `receive` wait before they raise TimeoutError."""
+        """Set how long `send` and `receive` wait before they raise TimeoutError."""
         self._socket.settimeout(seconds)
 
     def send(self, message: dict[str, Any]) -> None:
-        """Send one message. Raises OSError."""
+        """Send one message; raises OSError."""
         self._socket.sendall(json.dumps(message).encode() + b"\n")
 
     def send_with_descriptors(self, message: dict[str, Any], descriptors: list[int]) -> None:
-        """Send one short message and, with it, open files. Raises OSError."""
+        """Send one short message with open files; raises OSError."""
         socket.send_fds(self._socket, [json.dumps(message).encode() + b"\n"], descriptors)
 
     def take_descriptor(self) -> int:
-        """The next of the open files that came with messages. Raises LabError if there was none."""
+        """Return the next of the open files that came with messages; raises LabError if there is none."""
         if not self._descriptors:
             raise LabError("the lab's control socket: no open file came along")
         return self._descriptors.pop(0)
 
     def receive(self) -> dict[str, Any] | None:
-        """The next message, waiting for it; None: the other side is gone. Raises LabError on garbage."""
+        """Wait for the next message and return it; None if the other side is gone. Raises LabError on garbage."""
         while b"\n" not in self._received:
             if not self._fill():
                 return None
         return self._pop()
 
     def receive_ready(self) -> list[dict[str, Any]] | None:
-        """After the socket turned readable: the messages that are complete; None: the other side is gone."""
+        """Return the complete messages once the socket is readable; None if the other side is gone."""
         if not self._fill():
             return None
         messages = []
