@@ -34,7 +34,7 @@ from bench.matcher import command as matcher
 
 
 def main() -> int:
-    """Command line; without a measurement, all of them."""
+    """Run the command line; without a measurement, run all of them."""
     parser = argparse.ArgumentParser(
         prog="python -m bench", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )

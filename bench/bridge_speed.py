@@ -49,7 +49,7 @@ if TYPE_CHECKING:
     from sidecar.ros.bridge import RosBridge
 
 CALLED_SERVICES = 4
-"""The caller goes round so many of the services; the others are only there."""
+"""Services that the caller calls in rotation; the others are only present."""
 WARM_UP_CALLS = 200
 CALL_TIMEOUT_S = 2.0
 FIRST_DOMAIN = 90
@@ -61,7 +61,7 @@ def say(line: str) -> None:
 
 
 def bounce(request: Any) -> Any:
-    """What a pair of bridges does to an empty request and its response."""
+    """Do what a pair of bridges does to an empty request and its response."""
     deserialize_message(serialize_message(request), Empty.Request)
     return deserialize_message(serialize_message(Empty.Response()), Empty.Response)
 
@@ -74,7 +74,7 @@ def service_names(count: int) -> list[str]:
 
 
 def report_cpu_on_request() -> None:
-    """Print the CPU time used so far for each line on standard input; end with it."""
+    """Print the CPU time used so far for each line of standard input; end when it ends."""
     for _ in sys.stdin:
         usage = resource.getrusage(resource.RUSAGE_SELF)
         say(str(usage.ru_utime + usage.ru_stime))

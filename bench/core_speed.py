@@ -62,7 +62,7 @@ class Side:
         self.datagrams = 0
 
     def told_to(self, other: Side) -> Peer:
-        """What the control plane would tell the other one."""
+        """Return what the control plane would send to the other side."""
         candidate = Candidate(InterfaceId(0), InterfaceName("eth0"), CandidateKind.HOST, self.address)
         return Peer(
             self.name,
@@ -77,7 +77,7 @@ class Side:
         )
 
     def turn(self, now: float) -> list[Batch]:
-        """Let engine and link talk until both are done; returns what leaves."""
+        """Let engine and link exchange messages until both are done; return what leaves."""
         engine, link = self.engine, self.link
         out: list[Batch] = []
         while True:
@@ -101,7 +101,7 @@ class Side:
 
 
 class Pair:
-    """The robot, the cloud and the simulated clock; `batch` datagrams are received before a side gets its turn."""
+    """The robot, the cloud and the simulated clock; a side receives `batch` datagrams before it gets its turn."""
 
     def __init__(self, batch: int) -> None:
         self.now = 1.0
@@ -110,7 +110,7 @@ class Pair:
         self.cloud = Side("cloud", Role.CLOUD, 2, self.now)
         self.sent = 0
         self.early: defaultdict[NodeName, list[Batch]] = defaultdict(list)
-        """What left in the turns between two batches, and is still to be carried."""
+        """Datagrams that left in the turns between two batches and are still to be carried."""
         for side, other in ((self.robot, self.cloud), (self.cloud, self.robot)):
             side.engine.apply_peers(PeerSet(Version(1), 1, (other.told_to(side),)), self.now)
         while SERVICE not in {use.name for use in self._carried()}:
@@ -151,7 +151,7 @@ class Pair:
 
 
 def turns(flight: list[Batch], most: int) -> Iterator[list[tuple[memoryview, int]]]:
-    """Cut a flight into what is received in one turn: about `most` datagrams at once, as the kernel joins them."""
+    """Cut a flight into the datagrams received in one turn: about `most` at once, as the kernel joins them."""
     turn: list[tuple[memoryview, int]] = []
     room = most
     for _, data, segment in flight:
@@ -169,7 +169,7 @@ def turns(flight: list[Batch], most: int) -> Iterator[list[tuple[memoryview, int
 
 @dataclass(frozen=True)
 class Traffic:
-    """What one line of the table measures."""
+    """The traffic that one line of the table measures."""
 
     name: str
     size: int
@@ -187,7 +187,7 @@ TRAFFIC = (
 
 
 def measure(traffic: Traffic, batch: int) -> tuple[str, float]:
-    """Run one kind of traffic and describe its cost; returns also the Mbit of payload that a CPU second carries."""
+    """Run one kind of traffic; return a description of its cost, and the Mbit of payload carried per CPU second."""
     pair = Pair(batch)
     payload = random.Random(1).randbytes(traffic.size)
     pair.call(payload, traffic.at_once)  # warm: windows grow, caches fill
@@ -207,7 +207,7 @@ def measure(traffic: Traffic, batch: int) -> tuple[str, float]:
 
 
 def main() -> None:
-    """Entry point."""
+    """Run the command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--profile", action="store_true", help="show the functions that cost most")
     parser.add_argument("--only", default="", help="run only the kinds of traffic whose name contains this")

@@ -1,7 +1,7 @@
-"""A cipher that only copies, for measuring what sealing costs. No program of ours imports it but benchmarks.
+"""Provides a cipher that only copies, to measure the cost of sealing. Only benchmarks import it.
 
-It takes the place of the AEAD where that is made, in this process; no configuration leads here. It is itself a call
-into Python for each datagram at either end, 0.2 us each: by so much sealing looks cheaper than it is.
+It replaces the AEAD where that is made, in this process; no configuration leads here. It costs a call into Python for
+each datagram at either end, 0.2 us each: sealing looks cheaper than it is by that much.
 """
 
 from __future__ import annotations
@@ -21,29 +21,29 @@ if TYPE_CHECKING:
 
 
 class NullCipher:
-    """Copies, in place of encrypting and authenticating; the tag is whatever the buffer held."""
+    """Copies instead of encrypting and authenticating; the tag is whatever the buffer held."""
 
     @staticmethod
     def encrypt_into(nonce: Buffer, data: Buffer, associated_data: Buffer, buf: Buffer, /) -> int:
-        """As a Cipher's."""
+        """Copy the data; the signature is that of a Cipher."""
         buf[: -aead.TAG_BYTES] = data  # type: ignore[index]  # a bytearray or memoryview
         return 0
 
     @staticmethod
     def decrypt_into(nonce: Buffer, data: Buffer, associated_data: Buffer, buf: Buffer, /) -> int:
-        """As a Cipher's, but of whatever comes."""
+        """Copy any data back without a check; the signature is that of a Cipher."""
         buf[:] = data[: -aead.TAG_BYTES]  # type: ignore[index]  # a bytearray or memoryview
         return 0
 
 
 def install() -> None:
-    """Seal nothing from now on, in this process."""
+    """Replace sealing by copying from now on, in this process."""
     aead.make_cipher = _make_null
 
 
 @contextlib.contextmanager
 def null_cipher() -> Iterator[None]:
-    """Seal nothing within the block, with keys that are made there."""
+    """Replace sealing by copying within the block, for keys that are made there."""
     real = aead.make_cipher
     install()
     try:

@@ -1,4 +1,4 @@
-"""How much the machine itself was in the way: the kernel's CPU pressure over a stretch of time."""
+"""Measures how much the machine itself interfered: the kernel's CPU pressure over a period."""
 
 from __future__ import annotations
 
@@ -7,18 +7,18 @@ from pathlib import Path
 
 _PRESSURE = Path("/proc/pressure/cpu")
 BUSY_SHARE = 0.5
-"""Above this share of time some program waited for a processor often enough to spoil latencies of tens of ms."""
+"""Above this share of time, programs waited for a processor often enough to spoil latencies of tens of ms."""
 
 
 class CpuPressure:
-    """Share of the time since it was made in which some program was ready but had no processor."""
+    """Share of the time since creation during which some program was ready but had no processor."""
 
     def __init__(self) -> None:
         self._started = time.monotonic()
         self._before_us = _total_us()
 
     def share(self) -> float | None:
-        """In [0, 1]; None where the kernel does not tell (PSI is off)."""
+        """Return the share in [0, 1]; None if the kernel does not report it (PSI is off)."""
         after_us = _total_us()
         if self._before_us is None or after_us is None:
             return None
