@@ -81,7 +81,7 @@ class StunServer:
 
     @property
     def outcomes(self) -> Counter[StunOutcome]:
-        """Return the number of datagrams so far, by outcome."""
+        """Datagrams so far, by outcome."""
         return Counter(self._responder.outcomes.copy())
 
     @property
