@@ -1,1 +1,1 @@
-"""What an attacker of the network does, for tests and measurements inside the lab: listen, change, repeat, flood."""
+"""Plays an attacker on the network, for tests and measurements inside the lab: listens, changes, repeats, floods."""

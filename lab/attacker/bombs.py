@@ -1,4 +1,4 @@
-"""Bytes that are small on the wire and huge as a ROS message, or none at all."""
+"""Makes bytes that are small on the wire and huge as a ROS message, or no message at all."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ MB = 1 << 20
 
 
 def bomb(sample: bytes, size: int, rng: random.Random) -> bytes:
-    """`size` bytes that begin as a message in CDR, one length of which announces as many elements as could be there."""
+    """Return `size` bytes that begin as a CDR message, one length of which announces as many elements as could fit."""
     head = bytearray(sample[:256])
     position = rng.randrange(1, len(head) // 4) * 4
     announced = size // rng.choice((1, 2, 4, 8, 16, 24, 56)) - rng.choice((0, 64))
@@ -21,7 +21,7 @@ def bomb(sample: bytes, size: int, rng: random.Random) -> bytes:
 
 
 def garbage(sample: bytes, rng: random.Random) -> bytes:
-    """Noise, or a message that is cut off, or has a few other bytes."""
+    """Return noise, or a message that is truncated or has a few bytes changed."""
     match rng.randrange(3):
         case 0:
             return rng.randbytes(10)
@@ -31,5 +31,5 @@ def garbage(sample: bytes, rng: random.Random) -> bytes:
             changed = bytearray(sample)
             for _ in range(4):
                 changed[rng.randrange(len(changed))] = rng.randrange(256)
-            # The last byte is gone as well, so that it is no answer, whatever became of the others.
+            # The last byte is cut too, so that it is no answer, whatever became of the others.
             return bytes(changed[:-1])

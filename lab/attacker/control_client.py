@@ -32,7 +32,7 @@ def open_channel(target: str, tls_dir: Path | None) -> grpc.Channel:
 
 
 def call(channel: grpc.Channel, method: str, messages: list[bytes], stay_s: float) -> dict[str, Any]:
-    """Send the messages, stay, and tell what became of the call."""
+    """Send the messages, stay, and return what became of the call."""
     outgoing: queue.SimpleQueue[bytes | None] = queue.SimpleQueue()
     for message in messages:
         outgoing.put(message)
@@ -62,7 +62,7 @@ def call(channel: grpc.Channel, method: str, messages: list[bytes], stay_s: floa
 
 
 def main() -> int:
-    """Command line."""
+    """Run the command line."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("target")
     parser.add_argument("method")

@@ -1,4 +1,4 @@
-"""Introductions that a member can make beside its own: of interfaces and sessions that do not exist, true or forged."""
+"""Makes introductions besides a member's own: of interfaces and sessions that do not exist, genuine or forged."""
 
 from __future__ import annotations
 
@@ -34,14 +34,14 @@ if TYPE_CHECKING:
     from sidecar.core.seam.links import LinkPeer
 
 PHANTOMS = range(200, 231)
-"""Numbers of interfaces that no host here has: with its own one as many as a peer may introduce."""
+"""Numbers of interfaces that no host here has; with the member's own, as many as a peer may introduce."""
 
 
 class FalseSessions:
-    """Makes the datagrams of one member."""
+    """Makes the false datagrams of one member."""
 
     def __init__(self, identity: LinkIdentity, key: ec.EllipticCurvePrivateKey) -> None:
-        """`key`: its certificate's, with which it signs what it likes."""
+        """Prepare; `key` is that of its certificate, with which it signs anything."""
         self._identity = identity
         self._key = key
         self._rng = random.Random(identity.session)
@@ -50,7 +50,7 @@ class FalseSessions:
         self._private = b""
         self._credential: SessionCredential | None = None
         self._known: dict[tuple[str, int, int, int], tuple[SealingKeys, frame.KeyOffer | None]] = {}
-        """What is made once for each phantom: so the attack costs the attacker little."""
+        """State made once for each phantom, so that the attack costs the attacker little."""
 
     def phantoms(self, path: Path, peer: LinkPeer) -> Iterator[bytes]:
         """Introduce interfaces in the present session, each with an offer of keys that is never followed, and probe."""
@@ -64,12 +64,12 @@ class FalseSessions:
         return self._introduction(path, peer, forged, self._identity.interface_id)
 
     def replay(self, path: Path, peer: LinkPeer) -> bytes:
-        """An introduction with a packet number of long ago, as somebody may have recorded it."""
+        """Return an introduction with an old packet number, as if it had been recorded."""
         own = decode_credential(self._identity.credential)
         return self._introduction(path, peer, own, self._identity.interface_id, number=1)
 
     def begin(self) -> None:
-        """Begin another session, as a sidecar does that is restarted."""
+        """Begin another session, as a restarted sidecar does."""
         own = decode_credential(self._identity.credential)
         self._private = os.urandom(32)
         self._credential = self._newer(own, public_key(self._private)).sign(self._key)
@@ -81,7 +81,7 @@ class FalseSessions:
         own, theirs = self._credential, decode_credential(peer.credential)
         private = X25519PrivateKey.from_private_bytes(self._private)
         keys = pair_keys(private, X25519PublicKey.from_public_bytes(theirs.public_key), own, theirs)
-        # The first one makes the session known.
+        # The first introduction makes the session known.
         yield self._introduction(path, peer, own, InterfaceId(PHANTOMS[0]))
         yield from self._introduced(path, peer, own, keys)
 

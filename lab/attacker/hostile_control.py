@@ -1,6 +1,6 @@
-"""The control stream of a member that was taken over: false reports, addresses of others, escape sequences.
+"""Corrupts the control stream of a compromised member: false reports, addresses of others, escape sequences.
 
-What it says beside the honest sidecar's words goes out on the same stream, with the same certificate.
+Its lies go out on the same stream as the honest sidecar's messages, with the same certificate.
 """
 
 from __future__ import annotations
@@ -34,20 +34,20 @@ if TYPE_CHECKING:
 
 REPORTS_A_TURN = 10
 INTERFACES = 32
-"""With 8 addresses each: as many as one announcement holds."""
+"""Interfaces with 8 addresses each: as many as one announcement holds."""
 CANDIDATES_EVERY_S = 3.0
 ESCAPES_EVERY_S = 7.0
-"""Some of them end the stream, which begins again."""
+"""Interval between escape sequences; some of them end the stream, which then restarts."""
 SERVICE_OF_OTHERS = ServiceName("/of_others")
 SLOW = Histogram.from_sparse([341], [MAX_COUNT], 0)
 FAST = Histogram.from_sparse([10], [MAX_COUNT], 0)
 
 
 class HostileControl(ControlSession):
-    """A control session that says more than it should."""
+    """A control session that sends more than it should."""
 
     means: Means
-    """Set on the class, before there is any."""
+    """Set on the class before any instance exists."""
     _candidates_at = 0.0
     _escapes_at = 0.0
     _serial = 1 << 40
@@ -56,7 +56,7 @@ class HostileControl(ControlSession):
     _rng = random.Random(1)
 
     def messages_to_send(self, now: float) -> list[SidecarMessage]:
-        """Also what is false."""
+        """Return the honest messages and the false ones."""
         honest = super().messages_to_send(now)
         if self.state is not ControlState.ONLINE or self.means.commander.stage is Stage.HONEST:
             return honest
@@ -109,7 +109,7 @@ class HostileControl(ControlSession):
         return [Report(latencies, paths, outcomes)] * REPORTS_A_TURN
 
     def _candidates_of_others(self) -> CandidateSet:
-        """Its own ones of before, and as many of the third party as find room, rightly signed."""
+        """Return its own previous candidates, and as many of the third party's as fit, correctly signed."""
         own = self._own.candidates
         false = tuple(
             Candidate(
@@ -129,7 +129,7 @@ class HostileControl(ControlSession):
         return replace(self._own, candidates=said, serial=self._serial, signature=signature)
 
     def set_candidates(self, candidates: CandidateSet) -> None:
-        """Keep what is honest; what was false stays until the next lie."""
+        """Keep the honest candidates; false ones stay until the next lie."""
         self._own = candidates
         super().set_candidates(self._signed(candidates.candidates))
 
@@ -139,6 +139,6 @@ class HostileControl(ControlSession):
         return ServiceSet(offers if self._registration.role is Role.CLOUD else (), uses)
 
     def set_services(self, services: ServiceSet) -> None:
-        """Keep what is honest."""
+        """Keep the honest services."""
         self._said = services
         super().set_services(services)

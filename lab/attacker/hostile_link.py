@@ -1,4 +1,4 @@
-"""An interface of a member that was taken over: beside its honest datagrams it sends all that its keys allow.
+"""Turns an interface of a compromised member hostile: besides honest datagrams it sends all that its keys allow.
 
 It runs on the sidecar's own thread, over its own socket, with its real paths, keys and packet numbers.
 """
@@ -38,33 +38,33 @@ if TYPE_CHECKING:
 
 SYMBOL = 1024
 ESCAPES = "\x1b[2J\x1b]0;owned\x07\r\n2026-01-01T00:00:00.000Z INFO runtime: all is well \u202e\x00\x9b31m"
-"""What a terminal would obey, and what would pass for another line of the log."""
+"""Sequences that a terminal would obey, and text that would pass for another line of the log."""
 OFFERS_A_BURST = 1000
-"""Back to back: about as fast as 10,000 a second while it lasts."""
+"""Key offers sent back to back: about 10,000 a second while the burst lasts."""
 LARGE_ANSWER = "0 500000"
-"""In a request's `format`: half a megabyte back (lab/echo.py)."""
+"""`format` of a request for half a megabyte back (lab/echo.py)."""
 MAX_MESSAGE = 16 << 20
 
 
 @dataclass(frozen=True, slots=True)
 class Attack:
-    """One attack on each peer's living path, again and again."""
+    """An attack that is repeated on the live path of each peer."""
 
     name: str
-    """As the report has it."""
+    """Name in the report."""
     every_s: float
     make: Callable[[HostileLink, Path], Iterable[bytes]]
-    """The datagrams of one run to one path."""
+    """Makes the datagrams of one run on one path."""
     stages: frozenset[Stage] = frozenset({Stage.STEADY, Stage.SPOOFING})
     role: Role | None = None
-    """Of the attacker; None: either."""
+    """Role of the attacker; None for either."""
 
 
 class HostileLink(Link):
     """A link that attacks when its orders say so."""
 
     means: Means
-    """Set on the class, before there is any."""
+    """Set on the class before any instance exists."""
 
     def __init__(self, *arguments: Any, **named: Any) -> None:
         super().__init__(*arguments, **named)
@@ -72,7 +72,7 @@ class HostileLink(Link):
         self.sessions = FalseSessions(self.identity, self.means.key)
         self._spoofer = Spoofer()
         self._message = 1 << 40
-        # Not all in the same moment.
+        # Spread the attacks over time.
         self._due = {
             attack: time.monotonic() + attack.every_s * self.rng.random()
             for attack in ATTACKS
@@ -83,14 +83,14 @@ class HostileLink(Link):
     # -- what the driver calls ------------------------------------------------------------------------------------
 
     def next_timer(self) -> float:
-        """Also when the next attack is due."""
+        """Return the earlier of the link's next timer and the next attack."""
         honest = super().next_timer()
         stage = self.means.commander.stage
         due = min((at for attack, at in self._due.items() if stage in attack.stages), default=honest)
         return min(honest, due)
 
     def batches_to_send(self, now: float) -> list[Batch]:
-        """Also what attacks are due."""
+        """Return the honest batches, and those of attacks that are due."""
         batches = super().batches_to_send(now)
         stage = self.means.commander.stage
         for attack, due in self._due.items():
@@ -121,22 +121,22 @@ class HostileLink(Link):
     # -- datagrams ------------------------------------------------------------------------------------------------
 
     def sealed(self, path: Path, *frames: bytes) -> bytes:
-        """A datagram of the path, as authentic as any."""
+        """Return a datagram of the path, as authentic as any."""
         return self._builder._sealed(path, path.recovery.take_numbers(), time.monotonic(), *frames)
 
     def peer(self, path: Path) -> LinkPeer | None:
-        """Who is at its other end."""
+        """Return the peer at the other end of the path."""
         return self._table.by_session.get(path.session)
 
     def said(self, path: Path, *messages: Message) -> Iterator[bytes]:
-        """Short messages, each in a datagram of its own."""
+        """Yield short messages, each in a datagram of its own."""
         for message in messages:
             content = b"".join(encode_message(message))
             self._message += 1
             yield self.sealed(path, frame.encode_fragment_head(self._message, len(content), SYMBOL, 0), content)
 
     def requests(self, path: Path, count: int, payload: bytes) -> Iterator[bytes]:
-        """Requests that it may make, as urgent as can be."""
+        """Yield requests that it may make, as urgent as possible."""
         ids = [RequestId(self.rng.randbytes(16)) for _ in range(count)]
         self._last_requests = (self._last_requests + ids)[-1000:]
         service, kind = self.means.service
@@ -146,7 +146,7 @@ class HostileLink(Link):
             )
 
     def some_requests(self, count: int) -> list[RequestId]:
-        """Ids of requests that it made, and of some that nobody made."""
+        """Return ids of requests that it made, and of some that nobody made."""
         made = [self.rng.choice(self._last_requests) for _ in range(count // 2) if self._last_requests]
         return [*made, *(RequestId(self.rng.randbytes(16)) for _ in range(count - len(made)))]
 
@@ -181,7 +181,7 @@ def _wrong_offers(link: HostileLink, path: Path) -> Iterable[bytes]:
 
 
 def _other_offers(link: HostileLink, path: Path) -> Iterable[bytes]:
-    """With the right proof, of another key each time."""
+    """Offer a different key each time, with a valid proof."""
     phase = path.sealing.phase + 1
     for _ in range(10):
         key = public_key(link.rng.randbytes(32))
@@ -197,13 +197,13 @@ def _wrong_answers(link: HostileLink, path: Path) -> Iterable[bytes]:
 
 
 def _fuzz(link: HostileLink, path: Path) -> Iterable[bytes]:
-    """Frames that are none, and frames with numbers that mean nothing; acknowledgements are an attack of their own."""
+    """Send invalid frames, and frames with meaningless numbers; acknowledgements are an attack of their own."""
     rng = link.rng
     for _ in range(10):
         number = rng.getrandbits(rng.choice((8, 40, 64)))
         match rng.randrange(6):
             case 0:
-                # A first byte of 0 would be padding, and of 3 or 8 an acknowledgement or a goodbye.
+                # A first byte of 0 would be padding, 3 or 8 an acknowledgement or a goodbye.
                 yield link.sealed(path, b"\x0d" + rng.randbytes(rng.randint(1, 1000)))
             case 1:
                 about = (
@@ -217,7 +217,7 @@ def _fuzz(link: HostileLink, path: Path) -> Iterable[bytes]:
             case 3:
                 yield link.sealed(path, frame.encode_probe_reply(frame.ProbeReply(number)))
             case 4:
-                # The first symbol of a message that never goes on, as long as one may be.
+                # The first symbol of a message of up to the maximum size that never continues.
                 total = rng.choice((MAX_MESSAGE, rng.randint(SYMBOL, MAX_MESSAGE)))
                 yield link.sealed(path, frame.encode_fragment_head(number, total, SYMBOL, 0), rng.randbytes(SYMBOL))
             case _:
@@ -252,7 +252,7 @@ def _blind_acks(link: HostileLink, path: Path) -> Iterable[bytes]:
 
 
 def spoofed() -> frozenset[str]:
-    """The attacks whose datagrams claim to come from the third party."""
+    """Return the attacks whose datagrams claim to come from the third party."""
     return frozenset(attack.name for attack in ATTACKS if attack.stages in (_SPOOFED, _ACKNOWLEDGING))
 
 

@@ -1,4 +1,4 @@
-"""What the parts of one member that was taken over share."""
+"""Holds what the parts of one compromised member share."""
 
 from __future__ import annotations
 
@@ -14,29 +14,29 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class Means:
-    """Of one insider."""
+    """The means of one insider."""
 
     commander: Commander
     tally: Tally
     key: ec.EllipticCurvePrivateKey = field(repr=False)
-    """Its certificate's."""
+    """The key of its certificate."""
     service: tuple[str, str]
-    """Name and type of what it may call or offer."""
+    """Name and type of the service that it may call or offer."""
     request: bytes
-    """A request of it, small, in CDR."""
+    """A small request for the service, in CDR."""
     request_of_much: bytes
-    """One that asks for a large answer."""
+    """A request for a large answer."""
     request_that_is_large: bytes
     response: bytes
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Of the honest nodes."""
+        """Names of the honest nodes."""
         orders = self.commander.orders
         return () if orders is None else orders.names
 
     @property
     def third_party(self) -> tuple[str, str]:
-        """An IPv4 and an IPv6 address."""
+        """IPv4 and IPv6 address of the third party."""
         orders = self.commander.orders
         return ("192.0.2.1", "2001:db8::1") if orders is None else orders.third_party

@@ -1,8 +1,8 @@
-"""A member of the fleet with a good certificate, whose program somebody has changed to do everything at once.
+"""Runs a member of the fleet with a valid certificate, whose program was changed to attempt every attack at once.
 
-`python -m lab.attacker.insider --config FILE.yaml`, as a sidecar, robot or cloud. It is honest until FILE.orders
-tells it otherwise (`orders`), and counts in FILE.tally what it did. It takes only processor time that nobody else wants
-(SCHED_IDLE): an insider has a machine of its own, and what its work costs the others is theirs to bear, not its own.
+`python -m lab.attacker.insider --config FILE.yaml` replaces a robot's or cloud's sidecar. It is honest until
+FILE.orders says otherwise (`orders`), and counts its attacks in FILE.tally. It uses only processor time that nobody
+else wants (SCHED_IDLE): a real insider has a machine of its own, so only the cost that it causes at the others counts.
 """
 
 from __future__ import annotations
@@ -37,30 +37,30 @@ from sidecar.net.dataplane import ThreadedDataPlane
 
 SERVICE = ("/echo", "plr_demo_interfaces/srv/DetectPeople")
 BAD_ANSWERS = 0.1
-"""Share of the answers that are none."""
+"""Share of answers that are invalid."""
 BOMBS = 0.1
-"""Share of these that are large."""
+"""Share of the invalid answers that are large."""
 LARGE_BYTES = 100_000
 TURN_S = 0.5
 BOMB_TURNS = 4
 CLOUDS_CYCLE = 1.3
-"""A cloud's cycle is so much longer than a robot's."""
+"""Ratio of a cloud's cycle to a robot's."""
 _CLOSE_FROM = 3
 
 
 def idle() -> None:
-    """Take only the processor time that nobody else wants, in all threads to come."""
+    """Use only processor time that nobody else wants, in all future threads."""
     os.sched_setscheduler(0, os.SCHED_IDLE, os.sched_param(0))
 
 
 def main() -> int:
-    """Command line of the sidecar."""
+    """Run the sidecar's command line."""
     idle()
     config_file = Path(sys.argv[sys.argv.index("--config") + 1])
     config = yaml.safe_load(config_file.read_text())
     means = _means(config_file, config)
     HostileLink.means = HostileControl.means = means
-    # What somebody has changed.
+    # The changes to the program.
     change(managed_interface, "Link", HostileLink)
     change(runtime, "ControlSession", HostileControl)
     if config["role"] == "cloud":
@@ -72,7 +72,7 @@ def main() -> int:
 
 
 def change(where: Any, name: str, to: Any) -> None:
-    """Put something else in place of what the program calls so."""
+    """Replace what the program knows by this name."""
     assert hasattr(where, name), f"{name} is elsewhere by now"
     setattr(where, name, to)
 
@@ -95,7 +95,7 @@ def _means(config_file: Path, config: dict[str, Any]) -> Means:
 
 
 def _follow_cycle(means: Means) -> None:
-    """Begin anew at the end of a cycle, as a sidecar that is restarted: its peers talk to no session of before."""
+    """Restart at the end of a cycle, like a restarted sidecar: its peers do not talk to earlier sessions."""
     while True:
         time.sleep(TURN_S)
         means.tally.write()
@@ -104,7 +104,7 @@ def _follow_cycle(means: Means) -> None:
             means.tally.write()
             for number in map(int, os.listdir("/proc/self/fd")):
                 if number >= _CLOSE_FROM:
-                    with contextlib.suppress(OSError):  # it was this listing's own, or is closed by now
+                    with contextlib.suppress(OSError):  # it belonged to this listing, or is closed by now
                         os.set_inheritable(number, False)
             os.execv(sys.executable, [sys.executable, "-m", "lab.attacker.insider", *sys.argv[1:]])
 

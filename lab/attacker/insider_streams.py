@@ -1,7 +1,7 @@
-"""What a member does to the control plane beside its own stream: connections, and streams that are refused.
+"""Attacks the control plane besides a member's own stream: with connections, and streams that are refused.
 
-`python -m lab.attacker.insider_streams TARGET FILE TLS_DIR=NAME=ROLE ...`: with these certificates, while FILE.orders
-is there; counts in FILE.tally.
+`python -m lab.attacker.insider_streams TARGET FILE TLS_DIR=NAME=ROLE ...` uses these certificates while FILE.orders
+exists, and counts in FILE.tally.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from protos.program.tls_files import TlsFiles
 
 SILENT = 200
-"""Connections held open at once without a word; half as many with the beginning of a handshake."""
+"""Silent connections held open at once; half as many more have begun a handshake."""
 CLIENT_HELLO = bytes.fromhex("1603010200010001fc0303")
 STAY_S = 0.3
 STUN_PORT = 3478
@@ -51,13 +51,13 @@ class Insider:
         self.files: TlsFiles = load_tls_files(folder)
 
     def registration(self, name: str, role: Role, incarnation: int | None = None, **more: int | str) -> bytes:
-        """As whoever it says it is."""
+        """Return a registration under any name and role."""
         files = self.files
         return registration(files.certificate_der, files.private_key, name, role, incarnation, **more)  # type: ignore[arg-type]
 
 
 class Streams:
-    """All that goes on at the control plane's port."""
+    """All attacks on the control plane's port."""
 
     def __init__(self, target: str, file: Path, insiders: list[Insider]) -> None:
         self._target = target
@@ -69,7 +69,7 @@ class Streams:
         self._rng = random.Random(1)
 
     def run(self) -> None:
-        """Go on until killed."""
+        """Attack until killed."""
         for attack in (self._connections, self._registrations, self._stun):
             threading.Thread(target=self._again_and_again, args=(attack,), daemon=True).start()
         while True:
@@ -83,7 +83,7 @@ class Streams:
                 attack()
 
     def _connections(self) -> None:
-        """Hold silent connections open, and open others in place of those that are closed."""
+        """Hold silent connections open, and replace those that are closed."""
         held: list[socket.socket] = []
         while self._commander.want("silent connections"):
             for _ in range(min(CONNECTIONS_A_TURN, SILENT * 3 // 2 - len(held))):
@@ -152,7 +152,7 @@ def _lives(connection: socket.socket) -> bool:
 
 
 def main() -> int:
-    """Command line."""
+    """Run the command line."""
     idle()
     target, file, *who = sys.argv[1:]
     insiders = []

@@ -1,4 +1,4 @@
-"""Junk for a sidecar's port: datagrams that nobody should take, of every kind that costs something else to refuse."""
+"""Makes junk for a sidecar's port: datagrams that must be refused, one kind for each different cost of refusal."""
 
 from __future__ import annotations
 
@@ -13,26 +13,26 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
 LONGEST_BYTES = 1400
-"""Fits every path of the lab."""
+"""Longest junk; it fits every path of the lab."""
 _NUMBER = slice(HEADER_BYTES - 8, HEADER_BYTES)
-"""Where the packet number stands in the clear header."""
+"""Position of the packet number in the clear header."""
 
 
 class JunkKind(enum.StrEnum):
-    """What the junk looks like."""
+    """The kind of junk."""
 
     NOISE = "noise"
     """Random bytes."""
     HEADED = "headed"
-    """The clear header of a datagram seen on the way, another packet number, random bytes."""
+    """The clear header of a captured datagram, another packet number, random bytes."""
     INTRODUCED = "introduced"
-    """An introduction seen on the way, another packet number, random bytes behind the name it asks to be known by."""
+    """A captured introduction, another packet number, random bytes after the name that it asks to be known by."""
     FLIPPED = "flipped"
-    """A datagram seen on the way, one bit of it changed."""
+    """A captured datagram with one bit changed."""
     REPLAYED = "replayed"
-    """A datagram seen on the way, as it is."""
+    """A captured datagram, unchanged."""
     MANGLED = "mangled"
-    """A datagram seen on the way, cut, stretched, changed."""
+    """A captured datagram, cut, stretched or changed."""
 
 
 def make_junk(kind: JunkKind, seen: Sequence[bytes], count: int, rng: random.Random) -> list[bytes]:
@@ -63,12 +63,12 @@ def noise(rng: random.Random) -> bytes:
 
 
 def is_introduction(datagram: bytes) -> bool:
-    """Whether a datagram is one by which a sidecar introduces itself."""
+    """Return whether a sidecar introduces itself with this datagram."""
     return len(datagram) > HEADER_BYTES and bool(datagram[1] & INTRODUCTION_FLAG)
 
 
 def headed(datagram: bytes, rng: random.Random, kept: int = HEADER_BYTES) -> bytes:
-    """Return the first `kept` bytes with a packet number that may come next, and random bytes."""
+    """Return the first `kept` bytes with a plausible next packet number, and random bytes."""
     head = bytearray(datagram[:kept])
     number = int.from_bytes(head[_NUMBER], "big") + rng.randint(1, 1 << rng.randint(1, 40))
     head[_NUMBER] = (number & (1 << 64) - 1).to_bytes(8, "big")
@@ -84,7 +84,7 @@ def flipped(datagram: bytes, rng: random.Random) -> bytes:
 
 
 def mangled(datagram: bytes, rng: random.Random) -> bytes:
-    """Return the datagram cut, stretched, with bytes changed, doubled or swapped: whatever a fuzzer thinks of."""
+    """Return the datagram cut, stretched, or with bytes changed, doubled or swapped, as a fuzzer does."""
     changed = bytearray(datagram)
     for _ in range(rng.randint(1, 4)):
         where = rng.randint(0, len(changed))

@@ -1,5 +1,7 @@
-"""When a member of the fleet that somebody has taken over is honest, and when it is not: as a file beside its
-configuration says, which the harness writes and removes."""
+"""Decides when a compromised member of the fleet is honest, by a file beside its configuration.
+
+The harness writes and removes that file.
+"""
 
 from __future__ import annotations
 
@@ -18,56 +20,56 @@ ORDERS, TALLY = ".orders", ".tally"
 """Suffixes of the files beside the configuration."""
 LOOK_EVERY_S = 0.2
 LAST_STAGES = 0.65
-"""Of a cycle: until then everything that a session survives; then what ends it, ..."""
+"""Share of a cycle: until then come the attacks that a session survives; then those that end it, ..."""
 ACKNOWLEDGING = 0.71
-"""... beginning with spoofed sources, then acknowledgements of what nobody sent, which a peer bears once, ..."""
+"""... beginning with spoofed sources, then acknowledgements of what nobody sent, which a peer tolerates once, ..."""
 LAST_STAGE = 0.75
 """... and then new sessions, which make the peers forget it."""
 
 
 class Stage(enum.Enum):
-    """Where an insider stands."""
+    """The stage of an insider's cycle."""
 
     HONEST = enum.auto()
     STEADY = enum.auto()
-    """Everything at once that its peers bear without ending the session."""
+    """All attacks at once that its peers tolerate without ending the session."""
     SPOOFING = enum.auto()
     """Spoofed sources as well."""
     ACKNOWLEDGING = enum.auto()
-    """Blind acknowledgements, which end the session at who gets them."""
+    """Blind acknowledgements, which end the session at the receiver."""
     RESTARTING = enum.auto()
     """A new session every second."""
     OVER = enum.auto()
-    """The program begins again."""
+    """The program restarts."""
 
 
 @dataclass(frozen=True, slots=True)
 class Orders:
-    """What the file says."""
+    """The content of the file."""
 
     cycle_s: float
-    """From one restart of the program to the next."""
+    """Time from one restart of the program to the next."""
     third_party: tuple[str, str]
-    """An IPv4 and an IPv6 address at which somebody is who takes part in nothing."""
+    """IPv4 and IPv6 address of an uninvolved host."""
     names: tuple[str, ...] = ()
-    """Honest nodes."""
+    """Names of honest nodes."""
     only: tuple[str, ...] = ("*",)
-    """Patterns of the attacks' names (fnmatch): no others are run."""
+    """Patterns (fnmatch) of attack names; no others are run."""
 
     def want(self, attack: str) -> bool:
-        """Whether this attack is to be run."""
+        """Return whether this attack is to be run."""
         return any(fnmatch(attack, pattern) for pattern in self.only)
 
     def write(self, file: Path) -> None:
-        """Let the attacks begin; without the file there are none."""
+        """Write the file, so that the attacks begin; without it there are none."""
         file.write_text(json.dumps(asdict(self)))
 
 
 class Commander:
-    """Looks at the file."""
+    """Follows the file."""
 
     def __init__(self, file: Path, later: float = 1.0) -> None:
-        """`later`: by how much this one's cycle is longer than ordered, so that two of them do not keep step."""
+        """Follow `file`; `later` is the ratio of this cycle to the ordered one: two insiders must not keep step."""
         self.orders: Orders | None = None
         self._file = file
         self._later = later
@@ -76,7 +78,7 @@ class Commander:
 
     @property
     def stage(self) -> Stage:
-        """Where the cycle is now."""
+        """The current stage of the cycle."""
         orders = self.orders
         if orders is None:
             return Stage.HONEST
@@ -88,7 +90,7 @@ class Commander:
         return Stage.RESTARTING if gone < 1.0 else Stage.OVER
 
     def want(self, attack: str) -> bool:
-        """Whether an attack is to be run now."""
+        """Return whether an attack is to be run now."""
         orders = self.orders
         return orders is not None and orders.want(attack)
 
@@ -96,7 +98,7 @@ class Commander:
         while True:
             try:
                 said = json.loads(self._file.read_text())
-            except (OSError, ValueError):  # there is none, or it is being written
+            except (OSError, ValueError):  # there is no file, or it is being written
                 self.orders = None
             else:
                 if self.orders is None:

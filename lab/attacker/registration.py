@@ -1,4 +1,4 @@
-"""What a sidecar says first to the control plane, under whatever name, role, session and key it likes."""
+"""Makes a sidecar's first message to the control plane, under any name, role, session and key."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def registration(
     session: int | None = None,
     software_version: str = "attack",
 ) -> bytes:
-    """An encoded registration with a credential signed by this certificate's key; `session`: not its key's number."""
+    """Return an encoded registration with a credential signed by this key; `session` overrides the key's number."""
     incarnation = int(time.time() * 1000.0) if incarnation is None else incarnation
     public_key = hashlib.sha256(f"{name} {incarnation}".encode()).digest()
     number = session_number(NodeName(name), role, public_key) if session is None else SessionId(session)

@@ -1,6 +1,6 @@
-"""A cloud's sidecar that gives answers which are none, to as many requests as a file says.
+"""Runs a cloud's sidecar that gives invalid answers to a share of the requests set in a file.
 
-A member of the fleet with a good certificate, whose program somebody has changed: `python -m lab.attacker.rogue_cloud
+It is a member of the fleet with a valid certificate and a changed program: `python -m lab.attacker.rogue_cloud
 --config FILE.yaml`. FILE.share beside it holds the share of bad answers, in [0, 1]; without it all are honest.
 """
 
@@ -19,7 +19,7 @@ GARBAGE_BYTES = 10
 
 
 def main() -> int:
-    """Command line of the sidecar."""
+    """Run the sidecar's command line."""
     share_file = Path(sys.argv[sys.argv.index("--config") + 1]).with_suffix(SHARE)
     honest = Engine.complete
 
@@ -29,7 +29,7 @@ def main() -> int:
             payload, processing_s = random.randbytes(GARBAGE_BYTES), 0.0
         honest(engine, execution, payload, processing_s, now)
 
-    # What somebody has changed.
+    # The change to the program.
     setattr(Engine, "complete", complete)  # noqa: B010 - it is no method of ours
     return sidecar.main()
 

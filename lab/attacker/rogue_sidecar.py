@@ -1,7 +1,7 @@
-"""A robot's sidecar that asks for /echo whatever its application calls, and whatever its mapping says.
+"""Runs a robot's sidecar that requests /echo whatever its application calls, and whatever its mapping says.
 
-A member of the fleet with a good certificate, whose program somebody has changed: `python -m
-lab.attacker.rogue_sidecar --config FILE`.
+It is a member of the fleet with a valid certificate and a changed program: `python -m lab.attacker.rogue_sidecar
+--config FILE`.
 """
 
 from __future__ import annotations
@@ -19,12 +19,12 @@ WANTED = ServiceName("/echo")
 
 
 def main() -> int:
-    """Command line of the sidecar."""
+    """Run the sidecar's command line."""
 
     def forged(*arguments: Any, **fields: Any) -> RequestMessage:
         return dataclasses.replace(RequestMessage(*arguments, **fields), service=WANTED)
 
-    # What somebody has changed.
+    # The change to the program.
     assert hasattr(dispatcher, "RequestMessage"), "the requests are made elsewhere by now"
     setattr(dispatcher, "RequestMessage", forged)  # noqa: B010 - the module does not export it
     return sidecar.main()

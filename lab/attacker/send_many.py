@@ -1,4 +1,4 @@
-"""sendmmsg(2) by ctypes: many datagrams in one system call, so that a flood costs its sender little.
+"""Calls sendmmsg(2) through ctypes: many datagrams in one system call, so that a flood costs its sender little.
 
 UDP_SEGMENT would be cheaper still, but between network namespaces such runs arrive joined, as no stranger's would.
 """
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
 BATCH = 64
-"""Datagrams of one call."""
+"""Datagrams in one call."""
 
 
 class _IoVec(ctypes.Structure):
@@ -57,9 +57,9 @@ class Volley:
         self._count = len(datagrams)
 
     def send(self, sock: socket.socket, start: int, count: int) -> int:
-        """Send `count` datagrams from the one at `start` on (fewer at the end); returns how many left.
+        """Send `count` datagrams beginning at `start` (fewer at the end); return how many left.
 
-        Raises OSError when not even the first could be sent.
+        Raises OSError if not even the first could be sent.
         """
         count = min(count, self._count - start)
         size = ctypes.sizeof(_MMsgHdr)
@@ -72,9 +72,9 @@ class Volley:
 
 
 def flood(sockets: Sequence[socket.socket], datagrams: Sequence[bytes], rate_hz: float, seconds: float) -> int:
-    """Send the datagrams again and again at this rate, in turn over these connected sockets; returns how many left.
+    """Send the datagrams repeatedly at this rate, in turn over these connected sockets; return how many left.
 
-    A port that is closed (ECONNREFUSED) or a full queue (ENOBUFS) does not end it.
+    A closed port (ECONNREFUSED) or a full queue (ENOBUFS) does not end the flood.
     """
     volley = Volley(datagrams)
     start = time.monotonic()
@@ -87,7 +87,7 @@ def flood(sockets: Sequence[socket.socket], datagrams: Sequence[bytes], rate_hz:
         try:
             gone = volley.send(sockets[turn % len(sockets)], position, BATCH)
         except OSError:
-            gone = 1  # it counts as sent: what cannot be sent shall not be made up for by a burst
+            gone = 1  # count it as sent: a failure to send must not be made up for by a burst
         turn += 1
         sent += gone
         position = (position + gone) % len(datagrams)

@@ -1,4 +1,4 @@
-"""Sends UDP datagrams that claim to come from somebody else, out of raw sockets (raw(7)); no network here filters."""
+"""Sends UDP datagrams with a forged source from raw sockets (raw(7)); no network here filters them."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ THIRD_PARTYS_PORT = 4000
 
 
 class Spoofer:
-    """Somebody else's datagrams."""
+    """Sends datagrams with a forged source."""
 
     def __init__(self) -> None:
         self._sockets = {
@@ -24,7 +24,7 @@ class Spoofer:
         }
 
     def send(self, datagram: bytes, claimed: tuple[str, str], to: Address) -> None:
-        """Send it to an address, from the one of these two (IPv4, IPv6) that is of its family."""
+        """Send a datagram to an address, from the `claimed` address (IPv4, IPv6) of its family."""
         six = ":" in to[0]
         made = Captured("", bytes(ETHERNET_BYTES), (claimed[six], THIRD_PARTYS_PORT), to, datagram, outgoing=True)
         with contextlib.suppress(OSError):  # a full queue

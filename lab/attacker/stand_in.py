@@ -1,6 +1,6 @@
-"""Stands in for the control plane with a certificate that is none: `python -m lab.attacker.stand_in PORT TLS_DIR`.
+"""Stands in for the control plane with an unfit certificate: `python -m lab.attacker.stand_in PORT TLS_DIR`.
 
-Prints a line for every call that gets as far as being one.
+It prints a line for every call that is actually made.
 """
 
 from __future__ import annotations
@@ -14,16 +14,16 @@ import grpc
 
 
 class _Anything(grpc.GenericRpcHandler):
-    """Takes every call and says nothing."""
+    """Accepts every call and never answers."""
 
     def service(self, handler_call_details: grpc.HandlerCallDetails) -> Any:
-        """Serve a method, whichever it is."""
+        """Serve any method."""
         print(f"called: {handler_call_details.method}", flush=True)
         return grpc.stream_stream_rpc_method_handler(lambda requests, _: requests)
 
 
 def main() -> int:
-    """Command line."""
+    """Run the command line."""
     port, tls_dir = sys.argv[1], Path(sys.argv[2])
     key, certificate = ((tls_dir / name).read_bytes() for name in ("key.pem", "cert.pem"))
     server = grpc.server(ThreadPoolExecutor(4), handlers=[_Anything()])

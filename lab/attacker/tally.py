@@ -1,4 +1,4 @@
-"""What an attacker did, by attack: how often, how many messages, how many bytes. Kept in a file over its restarts."""
+"""Counts runs, messages and bytes of an attacker, by attack, in a file that survives its restarts."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ class Tally:
         self._counts: dict[str, list[int]] = json.loads(file.read_text()) if file.exists() else {}
 
     def add(self, attack: str, messages: int = 1, size: int = 0) -> None:
-        """One run of an attack: so many messages, and bytes of them all."""
+        """Count one run of an attack, its messages and their total bytes."""
         with self._lock:
             counts = self._counts.setdefault(attack, [0, 0, 0])
             counts[0] += 1

@@ -1,6 +1,6 @@
-"""An attacker on the way: sees the UDP datagrams that pass an interface, and puts some of its own on the wire.
+"""Plays an attacker on the path: it sees the UDP datagrams that pass an interface, and sends some of its own.
 
-Packet sockets (packet(7)) on the lab's routers and hosts. What it sends may carry any source address.
+It uses packet sockets (packet(7)) on the lab's routers and hosts. Its datagrams may carry any source address.
 """
 
 from __future__ import annotations
@@ -35,21 +35,21 @@ class Captured(NamedTuple):
 
     interface: str
     ethernet: bytes
-    """The 14 bytes in front: with them it goes the same way again."""
+    """The 14-byte header in front, with which it takes the same way again."""
     source: Address
     destination: Address
     payload: bytes
     outgoing: bool
-    """Whether it left by the interface, rather than came in."""
+    """Whether it left by the interface rather than came in."""
 
     def frame(self) -> bytes:
-        """The whole frame anew, with good checksums."""
+        """Return the whole frame, rebuilt with correct checksums."""
         family = socket.AF_INET6 if ":" in self.source[0] else socket.AF_INET
         source, destination = (socket.inet_pton(family, host) for host, _ in (self.source, self.destination))
         length = _UDP_HEADER.size + len(self.payload)
         unchecked = _UDP_HEADER.pack(self.source[1], self.destination[1], length, 0) + self.payload
         pseudo = source + destination + struct.pack(">II", length, _UDP)
-        # RFC 768, RFC 8200 section 8.1: 0 would say that there is none.
+        # RFC 768, RFC 8200 section 8.1: 0 would mean that there is no checksum.
         checksum = _checksum(pseudo + unchecked) or 0xFFFF
         udp = unchecked[:6] + checksum.to_bytes(2, "big") + unchecked[8:]
         if family == socket.AF_INET6:
@@ -62,7 +62,7 @@ class Captured(NamedTuple):
 
 
 def _checksum(data: bytes) -> int:
-    """The Internet checksum (RFC 1071)."""
+    """Return the Internet checksum (RFC 1071)."""
     data += bytes(len(data) & 1)
     total: int = sum(struct.unpack(f">{len(data) // 2}H", data))
     while total >> 16:
@@ -88,7 +88,7 @@ def parse(interface: str, frame: bytes, *, outgoing: bool) -> Captured | None:
         return None
     family = socket.AF_INET if len(source) == 4 else socket.AF_INET6
     from_port, to_port, _, _ = _UDP_HEADER.unpack_from(packet, head)
-    # A run that the kernel has not cut yet may have a length of 0.
+    # A run of datagrams that the kernel has not cut yet may have a length of 0.
     return Captured(
         interface,
         ethernet,
@@ -100,7 +100,7 @@ def parse(interface: str, frame: bytes, *, outgoing: bool) -> Captured | None:
 
 
 class Tap:
-    """Listens at one interface of a machine of the lab and sends frames out of it. Use it in a `with` block."""
+    """Listens at an interface of a lab machine and sends frames out of it. Use it in a `with` block."""
 
     def __init__(self, host: Host, interface: str) -> None:
         self.interface = interface
@@ -133,7 +133,7 @@ class Tap:
         return [one for one in parsed if one is not None]
 
     def wait_for(self, wanted: Callable[[Captured], bool], count: int = 1, timeout_s: float = 20.0) -> list[Captured]:
-        """Listen until `count` such datagrams passed. Raises TimeoutError."""
+        """Listen until `count` such datagrams have passed; raises TimeoutError."""
         found: list[Captured] = []
         end = time.monotonic() + timeout_s
         while len(found) < count:
