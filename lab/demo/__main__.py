@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 DEADLINE_MS = 100.0
 RATE_HZ = 10.0
 ROBOTS = {"wlan0 alone": ("wlan0",), "wwan0 alone": ("wwan0",), "PLR, both": ("wlan0", "wwan0")}
-"""Shown name -> interfaces; each in a ROS domain of its own on the same host."""
+"""Shown name -> interfaces; each robot has a ROS domain of its own on the same host."""
 CLOUDS = ("cloud_a", "cloud_b")
 _PROGRESS = re.compile(r"unanswered\s+(\d+).*late\s+(\d+).*median\s+([\d.]+|-)")
 
@@ -52,7 +52,7 @@ console = Console(highlight=False, soft_wrap=True)
 
 
 class DemoStage(Stage):
-    """The phases' hands on the system."""
+    """Carries out the phases on the system."""
 
     def __init__(self, lab: Lab, system: System) -> None:
         self._lab = lab
@@ -88,7 +88,7 @@ class DemoStage(Stage):
 
 
 def main() -> int:
-    """Command line; exit code 0 only if every request of the PLR robot was answered exactly once."""
+    """Run the command line; return 0 only if every request of the PLR robot was answered exactly once."""
     parser = argparse.ArgumentParser(
         prog="python -m lab.demo", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
@@ -182,7 +182,7 @@ def _slug(name: str) -> str:
 
 
 def _play(stage: Stage, clients: dict[str, Part], seconds: float) -> tuple[list[report.Mark], float]:
-    """Run the phases; returns when each began, and the second 0 (monotonic)."""
+    """Run the phases; return when each began, and second 0 (monotonic)."""
     zero = time.monotonic()
     unit = seconds / sum(phase.weight for phase in PHASES)
     marks = []
@@ -208,7 +208,7 @@ def _progress(name: str, client: Part) -> str:
 
 
 def _shares_of_wins(system: System) -> dict[str, float]:
-    """Share of PLR's answers that came over each interface."""
+    """Return the share of PLR's answers that came over each interface."""
     port = 9464 + list(ROBOTS).index("PLR, both")
     wins: dict[str, float] = {}
     for series, value in system.metrics("robot", port).items():

@@ -1,4 +1,4 @@
-"""The demo's figures: table, plot, JSON, one sentence."""
+"""Reports the demo's figures: table, plot, JSON, one sentence."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 UNANSWERED_MS = 10_000.0
-"""An unanswered request counts as this in means and quantiles; left out, the worse system would look better."""
+"""Latency of an unanswered request in means and quantiles; if left out, the worse system would look better."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,7 +45,7 @@ class Contender:
     p99_ms: float
     miss_ratio: float
     share_of_wins: float | None
-    """Of the requests that PLR answered, how many over this path; None where that says nothing."""
+    """Share of the requests that PLR answered over this path; None where that is meaningless."""
 
 
 def contender(name: str, run: dict[str, Any], share_of_wins: float | None) -> Contender:
@@ -68,7 +68,7 @@ def contender(name: str, run: dict[str, Any], share_of_wins: float | None) -> Co
 
 
 def table(contenders: list[Contender], deadline_ms: float) -> Table:
-    """For people."""
+    """Return the figures as a table."""
     title = f"Robot asking for a path at 10 Hz, deadline {deadline_ms:g} ms; latencies in ms"
     shown = Table(box=box.SIMPLE, pad_edge=False, title=title)
     shown.add_column("", no_wrap=True)
@@ -90,7 +90,7 @@ def table(contenders: list[Contender], deadline_ms: float) -> Table:
 
 
 def sentence(contenders: list[Contender], deadline_ms: float) -> str:
-    """What was seen, in one sentence, whatever it was."""
+    """Return what was observed, good or bad, in one sentence."""
     plr, *singles = contenders[::-1]
     missed = ", ".join(f"{single.name} {single.miss_ratio:.1%}" for single in singles[::-1])
     return (
@@ -103,7 +103,7 @@ def sentence(contenders: list[Contender], deadline_ms: float) -> str:
 def write_json(
     path: Path, contenders: list[Contender], marks: list[Mark], lateness_ms: dict[str, float], said: str
 ) -> None:
-    """Everything that the table and the sentence say, and how late the link emulator's timers ran."""
+    """Write everything in the table and the sentence, and how late the link emulator's timers ran."""
     content = {
         "contenders": [asdict(contender) for contender in contenders],
         "phases": [asdict(mark) for mark in marks],
@@ -114,7 +114,7 @@ def write_json(
 
 
 def plot(path: Path, runs: dict[str, dict[str, Any]], marks: list[Mark], zero_s: float, deadline_ms: float) -> None:
-    """Latency of every request along the run, one panel for each robot."""
+    """Plot the latency of every request along the run, one panel for each robot."""
     figure, panels = plt.subplots(len(runs), 1, sharex=True, sharey=True, figsize=(11, 2.3 * len(runs)))
     for panel, (name, run) in zip(panels, runs.items(), strict=True):
         sent = [r["sent_s"] - zero_s for r in run["requests"]]

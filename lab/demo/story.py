@@ -1,4 +1,4 @@
-"""What happens in the demo, second by second."""
+"""Defines what happens in the demo, second by second."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
 WLAN = LinkProfile(delay_ms=8, jitter_ms=6, loss=0.005, rate_kbps=40_000)
-"""Indoor Wi-Fi: one way, each way."""
+"""Indoor Wi-Fi, in each direction; the delay is one-way."""
 WWAN = LinkProfile(delay_ms=22, jitter_ms=8, loss=0.002, rate_kbps=20_000)
-"""5G on the move."""
+"""5G while driving."""
 
 
 @dataclass(frozen=True, slots=True)
 class Phase:
-    """A stretch of the demo under one trouble; `weight` is its share of the whole."""
+    """A period of the demo under one trouble; `weight` is its share of the whole."""
 
     name: str
     weight: float
@@ -30,32 +30,32 @@ class Stage:
     """What the phases may do to the running system."""
 
     def blackhole(self, interface: str) -> None:
-        """All datagrams of this carrier are lost, its interface stays up."""
+        """Lose all datagrams of this carrier; its interface stays up."""
         raise NotImplementedError
 
     def restore(self, interface: str) -> None:
-        """The carrier is back."""
+        """Bring the carrier back."""
         raise NotImplementedError
 
     def kill_cloud(self) -> None:
-        """SIGKILL to the second cloud's ROS server and sidecar."""
+        """Send SIGKILL to the second cloud's ROS server and sidecar."""
         raise NotImplementedError
 
     def start_cloud(self) -> None:
-        """The second cloud comes back."""
+        """Bring the second cloud back."""
         raise NotImplementedError
 
     def kill_control_plane(self) -> None:
-        """SIGKILL to the control plane."""
+        """Send SIGKILL to the control plane."""
         raise NotImplementedError
 
     def start_control_plane(self) -> None:
-        """The control plane comes back."""
+        """Bring the control plane back."""
         raise NotImplementedError
 
 
 def _nothing(stage: Stage) -> None:
-    """Both links are good."""
+    """Do nothing: both links are good."""
 
 
 def _wlan_dark(stage: Stage) -> None:
@@ -97,5 +97,5 @@ PHASES = (
     Phase("control plane killed -9", 8, _control_killed, "#dcecd8"),
     Phase("control plane back", 5, _control_back),
 )
-"""A minute at the default length. A rest follows each darkness: the robot with that carrier only then hands a backlog
-to the servers that all three share."""
+"""The phases, a minute at the default length. A rest follows each dark phase: then the robot with only that carrier
+hands its backlog to the servers that all three share."""
