@@ -1,1 +1,1 @@
-"""The alerts of deploy/prometheus in a real Prometheus and Alertmanager, beside a real control plane."""
+"""Tests the alerts of deploy/prometheus in a real Prometheus and Alertmanager, with a real control plane."""

@@ -1,7 +1,7 @@
-"""`python -m bench alerts`: what a real Alertmanager says when a server of a fleet hangs, another one's ROS node dies,
-then a whole server, and then the control plane.
+"""`python -m bench alerts`: shows what a real Alertmanager says as parts of a fleet fail.
 
-The control plane and its mutual TLS are real, the members are control streams alone (`bench.control`).
+A server hangs, another server's ROS node dies, then a whole server, and then the control plane. The control plane and
+its mutual TLS are real; the members are only control streams (`bench.control`).
 """
 
 from __future__ import annotations
@@ -29,15 +29,15 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
 LONGEST_FOR_S = 300.0
-"""No rule waits longer before it fires."""
+"""Longest wait of any rule before it fires."""
 SHORT_S = 120.0
-"""A ROS node may be away for so long."""
+"""How long a ROS node may be away."""
 PATIENCE_S = 300.0
 LOOK_EVERY_S = 0.05
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Options of `python -m bench alerts`."""
+    """Add the options of `python -m bench alerts`."""
     parser.add_argument("--robots", type=int, default=50, metavar="N", help="robots (default %(default)s)")
     parser.add_argument("--servers", type=int, default=5, metavar="N", help="servers, 4 at least (default %(default)s)")
     parser.add_argument("--interfaces", type=int, default=2, metavar="N", help="of a robot (default %(default)s)")
@@ -50,7 +50,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    """Run it; returns the exit code: 1 unless each death was notified once, and nothing else."""
+    """Run it and return the exit code: 1 unless each death was notified once, and nothing else was."""
     most = resource.getrlimit(resource.RLIMIT_NOFILE)[1]
     resource.setrlimit(resource.RLIMIT_NOFILE, (most, most))
     with tempfile.TemporaryDirectory(prefix="plr-bench-") as temporary:
@@ -84,7 +84,7 @@ class _Trial:
         self._monitoring = Monitoring(folder, metrics, Ports(*others), scrape_s=options.scrape_s, pace=options.pace)
 
     async def run(self) -> int:
-        """Go through it."""
+        """Go through all failures."""
         self._plane.start()
         try:
             await asyncio.sleep(5.0)
@@ -107,7 +107,7 @@ class _Trial:
             await asyncio.sleep(1.0)
 
     async def _judge(self) -> int:
-        # Whoever is scraped late, or registers late, may be told of now.
+        # Members that are scraped or register late may raise alerts now.
         await asyncio.sleep(3.0 + 3.0 * self._options.scrape_s)
         await self._tell_series()
         if self._options.series_only:
@@ -151,7 +151,7 @@ class _Trial:
         return heard == wanted
 
     async def _heard(self) -> list[str]:
-        """The alerts of all notifications since the last call, until the slowest rule would have fired."""
+        """Return the alerts notified since the last call, once the slowest rule would have fired."""
         await asyncio.sleep(LONGEST_FOR_S / self._options.pace + 10.0)
         pending = await asyncio.to_thread(self._monitoring.firing)
         told = self._monitoring.notifications[self._heard_before :]

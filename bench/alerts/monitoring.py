@@ -1,4 +1,4 @@
-"""A Prometheus and an Alertmanager with the files of deploy/, faster, and a receiver that keeps what is notified."""
+"""Runs Prometheus and Alertmanager with the files of deploy/, sped up, and a receiver that keeps the notifications."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ _UNITS_S = {"s": 1, "m": 60, "h": 3600}
 
 
 class MonitoringError(RuntimeError):
-    """A program did not start or does not answer; the text names its log."""
+    """A program did not start, or does not answer; the text names its log."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,14 +37,14 @@ class Notification:
 
     receiver: str
     firing: tuple[str, ...]
-    """Name and labels of each alert that fires."""
+    """Name and labels of each firing alert."""
     links: tuple[str, ...]
-    """Where their runbook_url leads."""
+    """Targets of their runbook_url."""
 
 
 @dataclass(frozen=True, slots=True)
 class Ports:
-    """Where everybody listens, on loopback."""
+    """The ports of all programs, on loopback."""
 
     prometheus: int
     alertmanager: int
@@ -52,14 +52,14 @@ class Ports:
 
 
 class Monitoring:
-    """Started by `start`, ended by `close`. `pace`: how much shorter the rules' and the Alertmanager's waits are."""
+    """Both programs, started by `start` and ended by `close`; `pace` divides the waits of rules and Alertmanager."""
 
     def __init__(self, folder: Path, scraped: int, ports: Ports, *, scrape_s: float, pace: float) -> None:
         self.notifications: list[Notification] = []
         self._folder = folder
         self._ports = ports
         self.pages = ""
-        """What every runbook_url begins with."""
+        """Common prefix of every runbook_url."""
         self._processes: list[subprocess.Popen[bytes]] = []
         self._receiver = ThreadingHTTPServer(("127.0.0.1", 0), self._handler())
         threading.Thread(target=self._receiver.serve_forever, daemon=True).start()
@@ -117,7 +117,7 @@ class Monitoring:
         (self._folder / "alertmanager.yml").write_text(yaml.safe_dump(config))
 
     def start(self) -> None:
-        """Start both, and wait until they answer. Raises MonitoringError."""
+        """Start both, and wait until they answer; raises MonitoringError."""
         ports = self._ports
         self._run(
             "prometheus",
@@ -162,16 +162,16 @@ class Monitoring:
         self._receiver.server_close()
 
     def value(self, query: str) -> float:
-        """The sum of what a query finds; 0 for nothing."""
+        """Return the sum of a query's results; 0 if there are none."""
         found = self._ask(f"query?query={quote(query)}")["result"]
         return sum(float(sample["value"][1]) for sample in found)
 
     def firing(self) -> Counter[str]:
-        """How many alerts of each name fire or wait to, in Prometheus' eyes."""
+        """Return how many alerts of each name are firing or pending in Prometheus."""
         return Counter(alert["labels"]["alertname"] for alert in self._ask("alerts")["alerts"])
 
     def series(self) -> int:
-        """Series in Prometheus' head."""
+        """Return the number of series in Prometheus' head block."""
         return int(self._ask("status/tsdb")["headStats"]["numSeries"])
 
     def _ask(self, path: str) -> Any:
