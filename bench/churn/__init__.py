@@ -1,5 +1,5 @@
-"""Minutes of trouble for the whole system, and what it cost: requests lost, answered twice, memory and threads grown.
+"""Disturbs the whole system for minutes, and counts requests lost or answered twice, and growth in memory and threads.
 
-The troubles are drawn beforehand from a seed (`schedule`), done to the lab by `hands`, each only once the resources
-that stay are seen to work (`runner`), while `samples` watches the processes. `report` judges.
+The troubles are drawn beforehand from a seed (`schedule`). `runner` has `hands` inflict each on the lab only once the
+remaining resources are seen to work, while `samples` watches the processes. `report` judges.
 """

@@ -26,11 +26,11 @@ if TYPE_CHECKING:
 OURS = ("robot.sidecar", *(f"{cloud}.sidecar" for cloud in SERVERS), "controlplane")
 BAD_LINES = ("Traceback", "internal error")
 NON_TTY_EVERY = 20
-"""Without a terminal only every so many lines of progress are shown."""
+"""Without a terminal, only one in this many lines of progress is shown."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Options of `python -m bench churn`."""
+    """Add the options of `python -m bench churn`."""
     parser.add_argument("--minutes", type=float, default=10.0, help="length of the run (default %(default)s)")
     parser.add_argument("--seed", type=int, default=1, help="seed of troubles and links (default %(default)s)")
     parser.add_argument(
@@ -40,7 +40,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    """Run and write churn.json; returns the exit code: 1 when a request was lost or doubled, or a process grows."""
+    """Run, write churn.json and return the exit code: 1 if a request was lost or doubled, or a process grows."""
     console = Console(highlight=False, soft_wrap=True)
     with _folder(options.keep_logs) as folder:
         outcome = churn(console, folder, options.minutes * 60.0, options.seed)
@@ -52,7 +52,7 @@ def run(options: argparse.Namespace) -> int:
 
 
 def churn(console: Console, folder: Path, length_s: float, seed: int) -> report.Outcome:
-    """One run in a lab of its own."""
+    """Do one run in a lab of its own."""
     schedule = make_schedule(seed, length_s)
     console.print(f"{len(schedule)} troubles in {length_s:.0f} s, seed {seed}:")
     for trouble in schedule:
@@ -121,7 +121,7 @@ def _result(hands: Hands, workload: Workload, client: Part) -> dict[str, Any]:
 
 
 def _dead_or_cursing(hands: Hands) -> list[str]:
-    """Programs that ended of themselves, and logs with what a program should not write."""
+    """Return programs that ended by themselves, and logs that contain what a program should not write."""
     found = [
         f"{name} ended with {hands.system.parts[name].process.returncode}"
         for name in OURS

@@ -1,4 +1,4 @@
-"""Does the troubles to the lab, undoes them, and looks whether what was in trouble works again."""
+"""Inflicts troubles on the lab, undoes them, and checks whether the disturbed resource works again."""
 
 from __future__ import annotations
 
@@ -22,23 +22,23 @@ FIRST_NEW_ADDRESS, NEW_ADDRESSES = 50, 100
 
 
 class Hands:
-    """The running system and what may be done to it."""
+    """The running system and what can be done to it."""
 
     def __init__(self, lab: Lab, folder: Path) -> None:
         self.system = System(lab, folder)
         self.complaints: list[str] = []
-        """What a program did wrong when it was asked to end."""
+        """What programs did wrong when asked to end."""
         self._lab = lab
         self._readdressed = 0
         self._answers_before: dict[str, float] = {}
 
     @staticmethod
     def lab(seed: int) -> Lab:
-        """The lab that the schedule's names mean."""
+        """Make the lab that the schedule's names refer to."""
         return Lab(LabConfig.of(interfaces=PATHS, clouds=len(SERVERS)), seed=seed)
 
     def start(self) -> None:
-        """Bring everything up, until the robot offers the services."""
+        """Bring everything up, and wait until the robot offers the services."""
         for interface, profile in PROFILES.items():
             self._lab.link(interface).set(profile)
         self.system.start_control_plane()
@@ -49,7 +49,7 @@ class Hands:
         self.system.wait_for_offer(self.system.start_robot(rules, interfaces=PATHS), len(rules))
 
     def begin(self, trouble: Trouble) -> None:
-        """Do it."""
+        """Inflict a trouble."""
         target = trouble.target
         match trouble.kind:
             case Kind.BLACKHOLE:
@@ -77,7 +77,7 @@ class Hands:
                 self._kill("controlplane")
 
     def end(self, trouble: Trouble) -> None:
-        """Undo it; what it takes to be back is still to come."""
+        """Undo a trouble; the resource still has to recover."""
         target = trouble.target
         match trouble.kind:
             case Kind.BLACKHOLE | Kind.UNPLUG:
@@ -104,10 +104,10 @@ class Hands:
             self._answers_before[target] = self._answers(target) if trouble.kind is Kind.KILL_ROS else 0.0
 
     def works(self, lane: Lane, target: str, well: frozenset[str]) -> bool:
-        """Whether a resource that was in trouble is in use again; `well` are the others that are.
+        """Return whether a disturbed resource is in use again; `well` holds the others that are.
 
-        A path: it answers to every server that is well. A server: it answered a request since it came back. The
-        control plane: the robot is connected.
+        A path is if it answers to every server that is well, a server if it has answered a request since its return,
+        the control plane if the robot is connected.
         """
         match lane:
             case Lane.PATHS:
@@ -121,7 +121,7 @@ class Hands:
                 return self.system.metrics("robot").get("plr_control_plane_connected") == 1
 
     def _answers(self, cloud: str) -> float:
-        """What the local servers have answered since their sidecar started."""
+        """Return how many requests the local servers have answered since their sidecar started."""
         return sum(
             value
             for series, value in self.system.metrics(cloud).items()
@@ -164,6 +164,6 @@ class Hands:
         part = self.system.parts[name]
         code = part.process.poll()
         if code is None:
-            part.kill()  # it was not given the time that it may take
+            part.kill()  # it was not given the time that a stop may take
         elif code != 0:
             self.complaints.append(f"{name} ended with {code} when it was stopped")

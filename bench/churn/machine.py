@@ -1,4 +1,4 @@
-"""What the machine itself did meanwhile: whoever shares it may be the reason why requests are late."""
+"""Records the load of the machine itself: other users of it may be the reason why requests are late."""
 
 from __future__ import annotations
 
@@ -11,20 +11,20 @@ from bench.pressure import CpuPressure
 _STAT = Path("/proc/stat")
 _IDLE = slice(3, 5)
 _STOLEN = 7
-"""Fields of proc(5), /proc/stat, `cpu`."""
+"""Fields of the `cpu` line of /proc/stat (proc(5))."""
 
 
 @dataclass(frozen=True, slots=True)
 class Load:
-    """Shares of the time between two looks, in [0, 1]."""
+    """Shares of the time between two measurements, in [0, 1]."""
 
     at_s: float
     busy: float
-    """Of all processors, at work for whomever."""
+    """Share of all processors at work, for any program."""
     stolen: float
-    """Of all processors, that the host gave to other machines although this one had work."""
+    """Share of all processors that the host gave to other machines although this one had work."""
     waiting: float | None
-    """In which some program had no processor; None where the kernel does not tell."""
+    """Share of time in which some program had no processor; None if the kernel does not report it."""
 
     def __str__(self) -> str:
         waiting = "" if self.waiting is None else f", {self.waiting:.0%} of the time somebody waits for one"
@@ -32,7 +32,7 @@ class Load:
 
 
 class Machine:
-    """Looks at the machine, each time since the time before."""
+    """Measures the machine's load, each time since the previous measurement."""
 
     def __init__(self) -> None:
         self.loads: list[Load] = []
@@ -40,7 +40,7 @@ class Machine:
         self._pressure = CpuPressure()
 
     def look(self, at_s: float) -> Load:
-        """Note the load since the last look."""
+        """Note and return the load since the last call."""
         now = _ticks()
         spent = [after - before for after, before in zip(now, self._before, strict=True)]
         total = max(sum(spent), 1)
@@ -51,7 +51,7 @@ class Machine:
 
 
 def processor_s(pid: int) -> float:
-    """Processor time that a process has used; 0 when it is gone."""
+    """Return the processor time that a process has used; 0 if it is gone."""
     try:
         fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
     except OSError:

@@ -1,4 +1,4 @@
-"""Judges a run, and writes what it was."""
+"""Judges a run, and writes a report of it."""
 
 from __future__ import annotations
 
@@ -21,17 +21,17 @@ if TYPE_CHECKING:
 
 QUARTERS = (0.0, 0.25, 0.5, 0.75, 1.0)
 FLAWS = ("missing", "answered_twice", "invalid", "strangers")
-"""Of a client's summary: each has to be 0."""
+"""Keys of a client's summary that must be 0."""
 
 
 @dataclass(slots=True)
 class Outcome:
-    """All that is known after a run."""
+    """Everything known after a run."""
 
     seed: int
     length_s: float
     clients: dict[str, dict[str, Any]]
-    """By client, its summary: sent, answered once, missing, twice, ..."""
+    """Summary of each client: sent, answered once, missing, twice, ..."""
     done: list[Done]
     postponed_s: dict[str, float]
     lives: list[Life]
@@ -40,7 +40,7 @@ class Outcome:
     failures: list[str] = field(default_factory=list)
 
     def verdicts(self) -> list[str]:
-        """Why the run failed; empty when it did not."""
+        """Return why the run failed; empty if it did not."""
         found = list(self.failures)
         for client, summary in self.clients.items():
             found += [f"{client}: {summary[flaw]} requests {flaw.replace('_', ' ')}" for flaw in FLAWS if summary[flaw]]
@@ -54,7 +54,7 @@ class Outcome:
 
 
 def recovery(done: list[Done]) -> dict[str, list[float]]:
-    """By kind of trouble, seconds from its end until the resource was seen in use again, sorted."""
+    """Return, by kind of trouble, the sorted seconds from its end until the resource was seen in use again."""
     times: dict[str, list[float]] = {}
     for entry in done:
         if entry.back_s is not None and entry.ended_s is not None:
@@ -63,7 +63,7 @@ def recovery(done: list[Done]) -> dict[str, list[float]]:
 
 
 def write_json(path: Path, outcome: Outcome) -> None:
-    """Everything, for machines."""
+    """Write everything for programs to read."""
     content = {
         "seed": outcome.seed,
         "length_s": outcome.length_s,
@@ -81,7 +81,7 @@ def write_json(path: Path, outcome: Outcome) -> None:
 
 
 def show(console: Console, outcome: Outcome) -> None:
-    """The same for people."""
+    """Print the same for people."""
     console.print(_requests(outcome))
     console.print(_recovery(outcome))
     console.print(_processes(outcome))
@@ -119,7 +119,7 @@ def _recovery(outcome: Outcome) -> Table:
 
 
 def _machine(loads: list[Load]) -> str:
-    """One line, as whoever shares the machine may be the reason for what is late."""
+    """Return one line on the load: other users of the machine may be the reason for delays."""
     if not loads:
         return "nothing is known of the machine"
     parts = [("busy", [load.busy for load in loads]), ("stolen", [load.stolen for load in loads])]

@@ -1,4 +1,4 @@
-"""Plays a schedule against the running system, and notes when each thing was back in use."""
+"""Plays a schedule against the running system, and notes when each resource was back in use."""
 
 from __future__ import annotations
 
@@ -20,16 +20,16 @@ if TYPE_CHECKING:
 
 TURN_S = 0.05
 LOOK_EVERY_S = 0.5
-"""How often it is looked whether something is back, which costs the machine a scrape."""
+"""Interval between checks whether something is back; each costs the machine a scrape."""
 SAMPLE_EVERY_S = 5.0
 STUCK_S = 60.0
-"""What is not back in use so long after its trouble is a failure of its own."""
+"""A resource not back in use this long after its trouble is a failure of its own."""
 _PROGRESS = re.compile(r"sent\s+(\d+)\s+unanswered\s+(\d+)")
 
 
 @dataclass(slots=True)
 class Done:
-    """A trouble as it really was; seconds of the run. None: not within the run."""
+    """A trouble as it really happened, in seconds of the run; None means not within the run."""
 
     trouble: Trouble
     began_s: float
@@ -43,7 +43,7 @@ class _LaneState:
 
     queue: deque[Trouble]
     shift_s: float = 0.0
-    """How much later than planned its troubles come, since something took its time to come back."""
+    """How much later than planned its troubles come, because a recovery took longer."""
     current: Done | None = None
 
 
@@ -61,18 +61,18 @@ class Runner:
         planned = list(schedule)
         self._lanes = {lane: _LaneState(deque(t for t in planned if t.lane is lane)) for lane in Lane}
         self._returning: dict[str, Done] = {}
-        """By target, what is not back in use yet."""
+        """Troubles whose target is not back in use yet, by target."""
         self._well = set(PATHS) | set(SERVERS)
         self._zero = 0.0
         self._load = ""
 
     @property
     def postponed_s(self) -> dict[str, float]:
-        """By lane, how much later its last troubles came than planned."""
+        """How much later than planned the last troubles of each lane came."""
         return {lane.value: state.shift_s for lane, state in self._lanes.items()}
 
     def run(self, clients: list[Part], ours: list[str], show: Callable[[str], None]) -> None:
-        """Play the schedule to its end. `ours` names the parts to be watched; `show` takes a line of progress."""
+        """Play the schedule to its end; `ours` names the parts to watch, `show` takes a line of progress."""
         self._zero = time.monotonic()
         look_at = sample_at = 0.0
         while (now := self._now()) < self._length_s:
@@ -111,7 +111,7 @@ class Runner:
             return
         state.queue.popleft()
         if now >= self._length_s * SPARED_FROM and ends_a_judged_process(trouble):
-            return  # postponed into the time that spares it
+            return  # postponed into the period in which its target is spared
         if now + trouble.lasts_s > self._length_s - CALM_END_S:
             state.queue.clear()  # postponed beyond the end
             return
@@ -144,7 +144,7 @@ class Runner:
                 self._well.add(target)
             elif done.ended_s is not None and self._now() - done.ended_s > STUCK_S:
                 self.failures.append(f"{target} was not in use again {STUCK_S:g} s after: {done.trouble}")
-                del self._returning[target]  # said once; its lane goes on without it being well
+                del self._returning[target]  # reported once; its lane goes on without waiting for it
 
     def _progress(self, now: float, clients: list[Part]) -> str:
         counts = []

@@ -1,4 +1,4 @@
-"""Memory and threads of the system's processes over time, and whether they grow."""
+"""Samples memory and threads of the system's processes over time, and judges whether they grow."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ if TYPE_CHECKING:
     from lab.system import Part
 
 MAX_GROWTH_MB = 4.0
-"""Over the second half of a run, by a straight line through the least of each minute, less twice its standard error:
-above what the allocator's steps amount to, far below a leak of one object for each request of ten minutes. Answers of
-16 MB come and go: what lies there between them is what adds up."""
+"""Tolerated growth over the second half of a run, by a straight line through the minimum of each minute, less twice its
+standard error. It is above the allocator's steps and far below a leak of one object for each request of ten minutes.
+Answers of 16 MB come and go, hence the minimum: what remains between them is what adds up."""
 LEAST_OF_S = 60.0
 MAX_MORE_THREADS = 2
-"""gRPC starts and ends threads of its own."""
+"""Tolerated growth in threads: gRPC starts and ends threads of its own."""
 MIN_JUDGED_S = 120.0
-"""A second half shorter than this is all warming up: imports, caches, arenas."""
+"""A second half shorter than this consists of warming up: imports, caches, arenas."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,7 +33,7 @@ class Sample:
     rss_mb: float
     threads: int
     processor_s: float = 0.0
-    """Used since it began."""
+    """Processor time used since the process began."""
 
 
 @dataclass(slots=True)
@@ -45,7 +45,7 @@ class Life:
     samples: list[Sample] = field(default_factory=list)
 
     def near(self, at_s: float, tolerance_s: float) -> Sample | None:
-        """The sample next to a moment, if there is one about then."""
+        """Return the sample closest to a moment, if there is one within the tolerance."""
         nearest = min(self.samples, key=lambda sample: abs(sample.at_s - at_s))
         return nearest if abs(nearest.at_s - at_s) <= tolerance_s else None
 
@@ -57,13 +57,13 @@ class Growth:
     name: str
     span_s: float
     rss_mb: float
-    """By a straight line through the least of each minute ..."""
+    """Growth by a straight line through the minimum of each minute ..."""
     rss_error_mb: float
     """... and twice the standard error of that."""
     threads: int
-    """By how much the most at once in the last quarter exceed those in the third."""
+    """By how much the maximum in the last quarter exceeds that in the third."""
     judged: bool
-    """It ran through the whole second half, and that was long enough to tell."""
+    """Whether it ran through the whole second half, and that was long enough to judge."""
 
     @property
     def grows(self) -> bool:
@@ -78,7 +78,7 @@ class Watch:
         self.lives: list[Life] = []
 
     def take(self, at_s: float, parts: Mapping[str, Part]) -> None:
-        """Sample the processes that run now."""
+        """Sample the processes that are running now."""
         for name, part in parts.items():
             pid = part.process.inner_pid if part.process.poll() is None else None
             read = None if pid is None else _read(pid)
@@ -91,14 +91,14 @@ class Watch:
             life.samples.append(Sample(at_s, *read, processor_s(pid)))
 
     def growths(self, length_s: float, every_s: float) -> list[Growth]:
-        """How the processes grew that ran at the end of a run of `length_s`, sampled every `every_s`."""
+        """Return the growth of the processes alive at the end of a run of `length_s`, sampled every `every_s`."""
         last = max((sample.at_s for life in self.lives for sample in life.samples), default=0.0)
         newest = {life.name: life for life in self.lives if life.samples[-1].at_s >= last - 2 * every_s}
         return [growth(life, length_s, every_s) for life in newest.values()]
 
 
 def growth(life: Life, length_s: float, every_s: float) -> Growth:
-    """How one process grew over the second half of a run of `length_s`."""
+    """Return how one process grew over the second half of a run of `length_s`."""
     half = [sample for sample in life.samples if sample.at_s >= length_s / 2]
     if len(half) < 3:
         return Growth(life.name, 0.0, 0.0, 0.0, 0, judged=False)
@@ -109,7 +109,7 @@ def growth(life: Life, length_s: float, every_s: float) -> Growth:
         minute = int(sample.at_s // LEAST_OF_S)
         least[minute] = min(sample.rss_mb, least.get(minute, math.inf))
     slope, error = slope_of([(minute * LEAST_OF_S, rss_mb) for minute, rss_mb in least.items()])
-    # They come and go with connections: what adds up is a higher peak.
+    # Threads come and go with connections: growth shows as a higher peak.
     middle = len(half) // 2
     threads = max(sample.threads for sample in half[middle:]) - max(sample.threads for sample in half[:middle])
     return Growth(
@@ -123,7 +123,7 @@ def growth(life: Life, length_s: float, every_s: float) -> Growth:
 
 
 def slope_of(points: Sequence[tuple[float, float]]) -> tuple[float, float]:
-    """Slope of the straight line of least squares, and its standard error."""
+    """Return the slope of the least-squares line, and its standard error."""
     count = len(points)
     mean_x = sum(x for x, _ in points) / count
     mean_y = sum(y for _, y in points) / count

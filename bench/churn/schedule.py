@@ -1,12 +1,12 @@
-"""Which trouble befalls what and when: a pure function of seed and length.
+"""Draws which trouble befalls what and when, as a pure function of seed and length.
 
-There are three lanes, which know nothing of each other: the robot's paths, the servers, the control plane. Within a
-lane at most one resource is in trouble, and a rest follows each trouble, so that at every moment at least one path and
-one server are well. Whether the one that was in trouble before is really back is not assumed from the rest's length:
-the runner waits until it is seen, and shifts what is left of the lane by that wait.
+There are three independent lanes: the robot's paths, the servers, the control plane. Within a lane at most one resource
+is in trouble, and a rest follows each trouble, so that at least one path and one server are always well. A rest does
+not prove that the resource is back: the runner waits until it is seen to be, and shifts the rest of the lane by that
+wait.
 
-In the last two thirds of a run the sidecar of the first server and the control plane live on, so that by the second
-half they have warmed up and the growth of their memory can be judged; the troubles of everything around them go on.
+In the last two thirds of a run the sidecar of the first server and the control plane are spared. By the second half
+they have warmed up, so that the growth of their memory can be judged. The troubles of everything around them go on.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ CONTROL = "control plane"
 
 
 class Lane(StrEnum):
-    """What fails one at a time."""
+    """Resources that fail one at a time."""
 
     PATHS = "paths"
     SERVERS = "servers"
@@ -29,7 +29,7 @@ class Lane(StrEnum):
 
 
 class Kind(StrEnum):
-    """A trouble; its value is what the timeline says."""
+    """A kind of trouble; its value is its name in the timeline."""
 
     BLACKHOLE = "swallows everything, carrier stays"
     UNPLUG = "loses its carrier"
@@ -53,7 +53,7 @@ class _LanePlan:
 
 
 _MOMENTARY = frozenset({Kind.REBIND_NAT, Kind.READDRESS})
-"""Done at once; nothing has to be undone."""
+"""Troubles that are over at once: nothing has to be undone."""
 _ENDS_A_SIDECAR = frozenset({Kind.KILL_SIDECAR, Kind.KILL_HOST, Kind.STOP_SIDECAR})
 _PLANS = {
     Lane.PATHS: _LanePlan(
@@ -71,7 +71,7 @@ _PLANS = {
     Lane.CONTROL: _LanePlan((Kind.KILL_CONTROL,), (CONTROL,), lasts_s=(1.0, 25.0), rest_s=(15.0, 30.0)),
 }
 SPARED_FROM = 1 / 3
-"""From this share of the run on, the processes that are judged in its second half live on."""
+"""From this share of the run on, the processes judged in its second half are spared."""
 FIRST_S = 3.0
 """Calm at the start ..."""
 CALM_END_S = 8.0
@@ -90,7 +90,7 @@ class Trouble:
 
     @property
     def ends_s(self) -> float:
-        """When it is undone."""
+        """When the trouble is undone."""
         return self.begins_s + self.lasts_s
 
     def __str__(self) -> str:
@@ -105,12 +105,12 @@ def make_schedule(seed: int, length_s: float) -> tuple[Trouble, ...]:
 
 
 def others(trouble: Trouble) -> tuple[str, ...]:
-    """The resources of its lane that have to work while it lasts."""
+    """Return the resources of its lane that must work while it lasts."""
     return tuple(target for target in _PLANS[trouble.lane].targets if target != trouble.target)
 
 
 def ends_a_judged_process(trouble: Trouble) -> bool:
-    """Whether it ends a process whose memory is judged over the second half; not done from SPARED_FROM on."""
+    """Return whether it ends a process whose memory is judged over the second half; not done from SPARED_FROM on."""
     return trouble.lane is Lane.CONTROL or (trouble.kind in _ENDS_A_SIDECAR and trouble.target == SERVERS[0])
 
 
@@ -120,7 +120,7 @@ def _draw_lane(lane: Lane, rng: random.Random, length_s: float) -> list[Trouble]
     bag: list[tuple[Kind, str]] = []
     at = FIRST_S + rng.uniform(0.0, plan.rest_s[0])
     while True:
-        if not bag:  # every kind befalls every target before any does twice
+        if not bag:  # every kind befalls every target once before any does so twice
             bag = [(kind, target) for kind in plan.kinds for target in plan.targets]
             rng.shuffle(bag)
         kind, target = bag.pop()

@@ -1,4 +1,4 @@
-"""What is asked during a run: small requests often, large answers, and a server that takes its time."""
+"""Defines the requests of a run: frequent small ones, large answers, and a slow server."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ class Service:
 
     @property
     def part(self) -> str:
-        """Ends the name of its servers."""
+        """Suffix of its servers' names."""
         return self.name.removeprefix("/")
 
     def rule(self) -> dict[str, Any]:
-        """The robot's configuration of it."""
+        """Return the robot's configuration of the service."""
         return {
             "name": self.name,
             "deadline_ms": self.deadline_ms,
@@ -43,15 +43,15 @@ class Workload:
     size: int
     """Bytes of a request."""
     answer_bytes: tuple[int, int] = (0, 0)
-    """The least and the most that is asked back, besides the echo's own; each order of magnitude as often."""
+    """Least and most bytes requested back besides the echo's own, each order of magnitude equally likely."""
 
     @property
     def grace_s(self) -> float:
-        """By then after the last request every one is answered or has failed."""
+        """Time after the last request by which every one is answered or has failed."""
         return self.service.lifetime_ms / 1e3 + 5.0
 
     def argv(self, length_s: float) -> list[str]:
-        """Of its program, without where the result goes."""
+        """Return the arguments of its program, without the destination of the result."""
         argv = ["-m", "lab.echo", "call", "--service", self.service.name, "--size", str(self.size)]
         argv += ["--answer-bytes", *map(str, self.answer_bytes)]
         argv += ["--rate", str(self.rate_hz), "--duration", str(length_s)]
@@ -67,7 +67,7 @@ MB = 1_000_000
 WORKLOADS = (
     Workload("1 kB at 20 Hz", "client-1kb", ECHO, rate_hz=20.0, size=1_000),
     Workload("100 kB at 2 Hz", "client-100kb", ECHO, rate_hz=2.0, size=100_000),
-    # 5 MB on average, of each server: 2 MB/s, where the two links together carry 11 MB/s and the worse one 4.
+    # 5 MB on average from each server, or 2 MB/s; the two links together carry 11 MB/s, the worse one 4.
     Workload("answers of 1 to 16 MB", "client-large", LARGE, rate_hz=0.2, size=1_000, answer_bytes=(MB, 16 * MB)),
     Workload("a server of 1.5 s", "client-slow", SLOW, rate_hz=0.4, size=1_000),
 )
