@@ -1,1 +1,1 @@
-"""What all measurements show their findings with: tables, targets with verdicts, pages."""
+"""Presents the findings of all measurements: tables, targets with verdicts, pages."""

@@ -1,4 +1,4 @@
-"""What figures were measured on."""
+"""Describes the machine on which figures were measured."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ _ROOT = Path(__file__).parents[2]
 
 
 def machine() -> dict[str, Any]:
-    """This machine, the moment and the commit that is measured, for the record."""
+    """Return this machine, the time and the measured commit, for the record."""
     lines = Path("/proc/cpuinfo").read_text().splitlines()
     models = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
     return {
@@ -27,7 +27,7 @@ def machine() -> dict[str, Any]:
 
 
 def commit() -> str:
-    """The checkout's commit, with `-dirty` if files differ from it; `unknown` where there is no checkout."""
+    """Return the checkout's commit, with `-dirty` if files differ from it; `unknown` without a checkout."""
     argv = ["git", "-C", str(_ROOT), "describe", "--always", "--dirty", "--abbrev=12", "--exclude=*"]
     try:
         found = subprocess.run(argv, capture_output=True, text=True, check=False, timeout=10)

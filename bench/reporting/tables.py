@@ -1,11 +1,11 @@
-"""Tables of text and numbers, as every measurement makes them."""
+"""Formats the tables of text and numbers that every measurement makes."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
 Figure = float | int | None
-"""None: not measured, and a note says why."""
+"""A figure; None if it was not measured, and a note says why."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -18,7 +18,7 @@ class Table:
 
 
 def text_of(cell: str | Figure) -> str:
-    """A cell for people."""
+    """Return the text of a cell."""
     if cell is None:
         return "-"
     if isinstance(cell, str | int):
@@ -27,7 +27,7 @@ def text_of(cell: str | Figure) -> str:
 
 
 def table_as_markdown(table: Table) -> str:
-    """One table, its title above it."""
+    """Return a table with its title above it."""
     lines = [table.columns, ("---",) * len(table.columns), *(tuple(map(text_of, row)) for row in table.rows)]
     rows = "\n".join(f"| {' | '.join(line)} |" for line in lines)
     return f"{table.title}\n\n{rows}\n" if table.title else f"{rows}\n"

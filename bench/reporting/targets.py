@@ -1,4 +1,4 @@
-"""What the figures are held against. A figure that was not measured has no verdict: it is neither met nor missed."""
+"""Compares figures with targets. A figure that was not measured has no verdict: it is neither met nor missed."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ VERDICTS = {True: "met", False: "missed", None: "not measured"}
 
 @dataclass(frozen=True, slots=True)
 class Target:
-    """A figure's bounds, both included."""
+    """The bounds of a figure, both inclusive."""
 
     key: str
     meaning: str
@@ -26,7 +26,7 @@ class Target:
     or_at_least: float = 0.0
 
     def met(self, figures: Mapping[str, Figure]) -> bool | None:
-        """Whether it is met; None when it was not measured."""
+        """Return whether the target is met; None if it was not measured."""
         value = figures.get(self.key)
         if value is None:
             return None
@@ -36,12 +36,12 @@ class Target:
         return (self.at_least is None or value >= self.at_least) and (self.at_most is None or value <= self.at_most)
 
     def verdict(self, figures: Mapping[str, Figure]) -> str:
-        """`met` in words."""
+        """Return `met` in words."""
         return VERDICTS[self.met(figures)]
 
     @property
     def wanted(self) -> str:
-        """The bounds for people."""
+        """The bounds as text."""
         bounds = []
         if self.at_least is not None:
             bounds.append(f"≥ {self.at_least:g}")

@@ -1,4 +1,4 @@
-"""Tables and verdicts on the terminal."""
+"""Shows tables and verdicts on the terminal."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 
 def rich_table(table: Table) -> RichTable:
-    """A table for the terminal."""
+    """Return a table for the terminal."""
     shown = RichTable(title=table.title, title_justify="left")
     for column in table.columns:
         shown.add_column(column, justify="right" if column else "left")
@@ -33,7 +33,7 @@ def show_verdicts(
     targets: Sequence[Target],
     notes: Mapping[str, str] | None = None,
 ) -> None:
-    """Show what is met and what is missed; `notes`, by the figure's name, say what it comes from."""
+    """Show which targets are met and missed; `notes` explain figures, by name."""
     table = RichTable(title="targets", title_justify="left")
     for column in ("figure", "value", "wanted", "verdict", *(("from",) if notes is not None else ())):
         shape: dict[str, Any] = {"no_wrap": column in ("value", "verdict")}

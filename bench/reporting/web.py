@@ -1,4 +1,4 @@
-"""HTML that needs nothing else: one file, pictures within it."""
+"""Makes self-contained HTML: one file that includes its pictures."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ img { max-width: 100%; } .note { color: #57606a; }
 
 
 def document(title: str, body: str) -> str:
-    """The whole page. `title` is text, `body` is HTML."""
+    """Return the whole page; `title` is text, `body` is HTML."""
     shown = html.escape(title)
     return (
         f'<!doctype html><html lang="en"><head><meta charset="utf-8"><title>FogROS2-PLR {shown}</title>'
@@ -41,12 +41,12 @@ def document(title: str, body: str) -> str:
 
 
 def note_as_html(text: str) -> str:
-    """A remark in small print."""
+    """Return a remark in small print."""
     return f'<p class="note">{html.escape(text)}</p>'
 
 
 def table_as_html(table: Table) -> str:
-    """One table, its title as the caption."""
+    """Return a table with its title as the caption."""
     heads = "".join(f"<th>{html.escape(column)}</th>" for column in table.columns)
     rows = "".join(
         "<tr>" + "".join(f"<td>{html.escape(text_of(cell))}</td>" for cell in row) + "</tr>" for row in table.rows
@@ -57,7 +57,7 @@ def table_as_html(table: Table) -> str:
 def verdicts_as_html(
     targets: Sequence[Target], figures: Mapping[str, Figure], notes: Mapping[str, str] | None = None
 ) -> str:
-    """What is met and what is missed; `notes`, by the figure's name, say what it comes from."""
+    """Return which targets are met and missed; `notes` explain figures, by name."""
     rows = []
     for target in targets:
         verdict = target.verdict(figures)
@@ -73,9 +73,9 @@ def verdicts_as_html(
 
 
 def svg_of(canvas: Canvas) -> bytes:
-    """The drawing as a file; the same drawing always gives the same bytes.
+    """Return the drawing as a file; the same drawing always gives the same bytes.
 
-    Small enough to be kept beside sources: letters are text, lines are exact to a hundredth of a point.
+    It is small enough to be kept beside sources: letters are text, lines are exact to a hundredth of a point.
     """
     image = io.BytesIO()
     with rc_context({"svg.hashsalt": "plr", "svg.fonttype": "none", "font.sans-serif": ["DejaVu Sans"]}):
@@ -84,6 +84,6 @@ def svg_of(canvas: Canvas) -> bytes:
 
 
 def picture(svg: bytes, alt: str) -> str:
-    """A drawing within the page."""
+    """Return a drawing embedded in the page."""
     data = base64.b64encode(svg).decode()
     return f'<p><img alt="{html.escape(alt)}" src="data:image/svg+xml;base64,{data}"></p>'
