@@ -1,1 +1,1 @@
-"""The control plane under the load of a fleet: the real program, real mutual TLS, hundreds to thousands of streams."""
+"""Loads the control plane with a fleet: the real program, real mutual TLS, hundreds to thousands of streams."""

@@ -1,9 +1,9 @@
-"""The anchor: gRPC for Python with its own mutual TLS, which answers what the control plane would, and knows nothing.
+"""Serves as the anchor: gRPC for Python with its own mutual TLS answers as the control plane would, without its logic.
 
-`python -m bench.control.bare PORT TLS_DIR SIZE SERVICE INTERFACE SERVER...` welcomes whoever registers, with the
-intervals of a fleet of SIZE, and maps each robot to the servers. After SIGUSR2 it answers a robot's next message with a
-mapping without the first of them. There is no gate, no registry, no estimate, no solver: what is left is what any
-control plane in this language pays for as many streams.
+`python -m bench.control.bare PORT TLS_DIR SIZE SERVICE INTERFACE SERVER...` welcomes every member that registers, with
+the intervals of a fleet of SIZE, and maps each robot to the servers. After SIGUSR2 it answers a robot's next message
+with a mapping without the first of them. There is no gate, no registry, no estimate, no solver: what is left is the
+cost that any control plane in this language has for as many streams.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 SERVICE = control_pb2.DESCRIPTOR.services_by_name["ControlPlane"].full_name
 LEASE_S, INTERVAL_S = 5.0, 0.5
-"""As the control plane's own by default."""
+"""The control plane's defaults."""
 
 
 class Bare:
@@ -64,12 +64,12 @@ class Bare:
                 await context.write(self._mappings[1])
 
     def lose_first(self) -> None:
-        """The first server is dead."""
+        """Treat the first server as dead."""
         self.lost = True
 
 
 async def serve(port: int, tls: Path, bare: Bare) -> None:
-    """Serve for ever."""
+    """Serve forever."""
     asyncio.get_running_loop().add_signal_handler(signal.SIGUSR2, bare.lose_first)
     ca, cert, key = ((tls / name).read_bytes() for name in ("ca.pem", "cert.pem", "key.pem"))
     server = grpc.aio.server(options=(("grpc.so_reuseport", 0),))
@@ -83,7 +83,7 @@ async def serve(port: int, tls: Path, bare: Bare) -> None:
 
 
 def main(arguments: list[str]) -> None:
-    """Command line."""
+    """Run the command line."""
     port, tls, size, service, interface, *servers = arguments
     bare = Bare(int(size), [NodeName(server) for server in servers], ServiceName(service), InterfaceName(interface))
     asyncio.run(serve(int(port), Path(tls), bare))

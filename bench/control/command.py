@@ -1,4 +1,4 @@
-"""`python -m bench control`: one fleet after another of 500 to 4,000 sidecars, each from its first start to its end."""
+"""`python -m bench control`: measures fleets of 500 to 4,000 sidecars, one by one, each from first start to end."""
 
 from __future__ import annotations
 
@@ -32,11 +32,11 @@ if TYPE_CHECKING:
 
 SERVERS = 3
 SETTLE_S = 20.0
-"""From the registration of all to what counts as steady: the first mappings are solved and have gone out."""
+"""Time from the registration of all to the steady state: the first mappings are solved and sent."""
 READY_S = 12.0
-"""From the start to what counts as empty: the solver's modules are loaded once nobody has come for some seconds."""
+"""Time from the start to the empty state: the solver's modules are loaded once nobody has come for some seconds."""
 DEAD_S = 2.0
-"""From a kill to the next start, at least."""
+"""Minimum time from a kill to the next start."""
 STATUS_LOOKS = 3
 LEASES = 'plr_departures_total{reason="lease_expired"}'
 LOOK_EVERY_S = 0.02
@@ -44,7 +44,7 @@ PATIENCE_S = 300.0
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Options of `python -m bench control`."""
+    """Add the options of `python -m bench control`."""
     parser.add_argument(
         "--size", type=int, action="append", metavar="N", help=f"sidecars (repeatable; default {SIZES})"
     )
@@ -56,7 +56,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    """Measure and write control.json; returns the exit code: 1 when a target is missed."""
+    """Measure, write control.json and return the exit code: 1 if a target is missed."""
     console = Console(highlight=False, soft_wrap=True)
     most = resource.getrlimit(resource.RLIMIT_NOFILE)[1]
     resource.setrlimit(resource.RLIMIT_NOFILE, (most, most))
@@ -69,7 +69,7 @@ def run(options: argparse.Namespace) -> int:
 
 
 class Fleet:
-    """One fleet of `size` sidecars at a control plane of its own."""
+    """One fleet of `size` sidecars with a control plane of its own."""
 
     def __init__(self, size: int, folder: Path, steady_s: float, say: Callable[[str], None]) -> None:
         self.figures: dict[str, float] = {}
@@ -132,7 +132,7 @@ class Fleet:
         self._figure("loop_hold_ms", 1000 * max(steady, self._turns("a server is lost")))
 
     async def measure_bare(self) -> None:
-        """Go through the same with the anchor in the control plane's place."""
+        """Go through the same with the anchor in place of the control plane."""
         clouds = [member.name for member in self._members if member.role is Role.CLOUD]
         what = (str(self._size), SERVICE, INTERFACES[0], *clouds)
         try:
@@ -152,8 +152,8 @@ class Fleet:
             self._plane.kill()
 
     async def _kill(self) -> None:
-        """Kill the control plane, and wait until everybody knows: one process needs seconds for 4,000 broken streams,
-        where 4,000 robots need none."""
+        """Kill the control plane, and wait until all members know: one process needs seconds for 4,000 broken streams,
+        which 4,000 robots would not."""
         self._plane.kill()
         await asyncio.sleep(DEAD_S)
         await self._until("everybody to notice", lambda: self._crowd.online() == 0)
@@ -198,7 +198,7 @@ class Fleet:
 
 
 async def _measure(sizes: tuple[int, ...], options: argparse.Namespace, console: Console) -> dict[str, float]:
-    """One size after the other, in one event loop: gRPC's threads do not survive theirs. Writes control.json."""
+    """Measure one size after the other, and write control.json. They share an event loop, as gRPC's threads need it."""
     wanted = targets(sizes)
     figures: dict[str, float] = {}
     details: dict[str, object] = {}

@@ -1,7 +1,7 @@
-"""A fleet's control streams in one event loop: each with its own certificate, TLS connection, and reports.
+"""Runs a fleet's control streams in one event loop: each with its own certificate, TLS connection, and reports.
 
-The dialogue is the sidecar's own (`ControlSession`: backoff, reports, heartbeats, acks); what stands around it in a
-robot, ROS and the data plane, is not here.
+The dialogue is the sidecar's own (`ControlSession`: backoff, reports, heartbeats, acks). The rest of a robot, ROS and
+the data plane, is left out.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ class Crowd:
     def __init__(self, members: Iterable[Member], target: str, ca_pem: bytes) -> None:
         self.members = {member.name: member for member in members}
         self.ended: Counter[str] = Counter()
-        """Why streams ended, by gRPC's code."""
+        """Ended streams by gRPC's code."""
         self.sets: Counter[str] = Counter()
         """Messages and bytes received."""
         self._target = target
@@ -57,16 +57,16 @@ class Crowd:
         self._tasks: dict[NodeName, asyncio.Task[None]] = {}
 
     def start(self) -> None:
-        """Connect everybody, each at its turn of the sidecar's backoff."""
+        """Connect all members, each when the sidecar's backoff lets it."""
         for member in self.members.values():
             self._tasks[member.name] = asyncio.create_task(self._keep_connected(member))
 
     async def leave(self, name: NodeName) -> None:
-        """This member's process is killed: its stream breaks."""
+        """Break the stream of a member, as if its process were killed."""
         await self._cancel([self._tasks.pop(name)])
 
     async def close(self) -> None:
-        """End all."""
+        """End all members."""
         await self._cancel(list(self._tasks.values()))
         self._tasks.clear()
 
@@ -77,15 +77,15 @@ class Crowd:
         await asyncio.gather(*tasks, return_exceptions=True)
 
     def online(self) -> int:
-        """How many are registered."""
+        """Return how many members are registered."""
         return sum(member.session.state is ControlState.ONLINE for member in self.members.values())
 
     def unmapped(self) -> int:
-        """How many robots have no mapping."""
+        """Return how many robots have no mapping."""
         return sum(member.role is Role.ROBOT and not member.mapped for member in self.members.values())
 
     def lose_server(self, dead: NodeName) -> float:
-        """Every robot finds at once that no path to this server is up; returns when."""
+        """Make every robot find at once that no path to this server is up; return when."""
         now = time.monotonic()
         for member in self.members.values():
             if member.role is Role.ROBOT:
@@ -95,12 +95,12 @@ class Crowd:
         return now
 
     def hang_server(self, hung: NodeName) -> None:
-        """No robot gets an answer from this server any more, which still takes requests."""
+        """Make a server accept requests but answer no robot any more."""
         for member in self.members.values():
             member.hung = hung
 
     def serve(self, name: NodeName, *, up: bool) -> None:
-        """A cloud's ROS node ends, or is there again."""
+        """End a cloud's ROS node, or bring it back."""
         self.members[name].serve(up=up)
         self._wake[name].set()
 
@@ -128,7 +128,7 @@ class Crowd:
                 await self._cancel(tasks)
             self.ended["closed"] += 1
         except asyncio.CancelledError:
-            # The call was cancelled, not we.
+            # The call was cancelled, not this task.
             task = asyncio.current_task()
             if task is None or task.cancelling():
                 raise
@@ -136,12 +136,12 @@ class Crowd:
             self.ended[f"{error.code().name}: {error.details()}"[:240]] += 1
             refused = error.code() in REFUSALS
         finally:
-            # Its own close looks at every task of the loop for calls of the channel: a minute for a thousand channels.
+            # Its own close searches every task of the loop for calls of the channel: a minute for a thousand channels.
             channel._channel.close()  # type: ignore[attr-defined]
             session.closed(time.monotonic(), refused=refused)
 
     async def _give_up(self, session: ControlSession, call: Call) -> None:
-        """As the sidecar does: the first write waits for the connection, so this is not for who writes."""
+        """Give up as the sidecar does; the first write waits for the connection, so the writer cannot do this."""
         await asyncio.sleep(max(session.next_timer() - time.monotonic(), 0.0))
         if session.welcome_overdue(time.monotonic()):
             self.ended["no welcome"] += 1

@@ -1,4 +1,4 @@
-"""One sidecar as its control stream shows it: what it says, what it is told, and when."""
+"""Models one sidecar as its control stream shows it: what it sends, what it receives, and when."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ class Member:
         self.dead: NodeName | None = None
         """The server to which no path is up any more."""
         self.hung: NodeName | None = None
-        """The server that takes requests and answers none."""
+        """The server that accepts requests and answers none."""
         self._servers = servers
         self._interfaces = interfaces
         self._rng = rng
@@ -95,7 +95,7 @@ class Member:
             self.serve(up=True)
 
     def report(self, interval_s: float) -> Report:
-        """What a robot measured in this time: ten requests a second over each of its paths in use."""
+        """Return what a robot measured in this time: ten requests a second over each of its paths in use."""
         if self.role is Role.CLOUD:
             return Report()
         requests = max(round(10 * interval_s), 1)
@@ -119,16 +119,16 @@ class Member:
         return Report(tuple(latencies), tuple(paths), (OutcomeReport(SERVICE, ok=requests),))
 
     def path_changes(self) -> Report:
-        """What a robot tells at once when a server is dead."""
+        """Return what a robot reports at once when a server is dead."""
         paths = [PathReport(interface, self.dead, False, Histogram()) for interface in self._interfaces if self.dead]
         return Report(paths=tuple(paths), changes_only=True)
 
     def serve(self, *, up: bool) -> None:
-        """The ROS node of a cloud that is configured to serve it is there, or not."""
+        """Note whether the ROS node that serves a cloud's configured service is present."""
         offers = (ServiceOffer(SERVICE, TYPE),) if up else ()
         self.session.set_services(ServiceSet(offers, unmet=() if up else (SERVICE,)))
 
     def takes(self, assignments: tuple[Assignment, ...], now: float) -> None:
-        """A mapping is in force."""
+        """Put a mapping into force."""
         self.mapped = frozenset(one.server for one in assignments)
         self.mapped_at = now

@@ -1,4 +1,4 @@
-"""The real control plane as a process of its own, under the limits of its unit, with its turns watched."""
+"""Runs the real control plane as a process of its own, under the limits of its unit, with its turns watched."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 UNIT = Path("deploy/systemd/plr-controlplane.service")
 USUAL_OPEN_FILES = 1024
-"""What systemd gives to a unit that does not say."""
+"""systemd's limit for a unit that sets none."""
 PATIENCE_S = 30.0
 
 
@@ -44,7 +44,7 @@ class Hold:
 
 
 class Plane:
-    """Starts, kills and looks at one control plane; `folder` takes its files."""
+    """Starts, kills and observes one control plane; `folder` holds its files."""
 
     def __init__(self, folder: Path, authority: Authority, ports: tuple[int, int]) -> None:
         self._folder = folder
@@ -65,7 +65,7 @@ class Plane:
             "PYTHONDONTWRITEBYTECODE": "",
             "PYTHONPYCACHEPREFIX": str(folder / "compiled"),
         }
-        """An installed program is compiled; this one is by its first start."""
+        """An installed program is compiled; this one is compiled by its first start."""
         self._config = folder / "controlplane.yaml"
         self._config.write_text(yaml.safe_dump(config))
 
@@ -81,21 +81,21 @@ class Plane:
 
     @property
     def target(self) -> str:
-        """Where it listens."""
+        """The address on which it listens."""
         return f"127.0.0.1:{self._port}"
 
     @property
     def pid(self) -> int:
-        """Its process."""
+        """Its process ID."""
         assert self._process is not None
         return self._process.pid
 
     def start(self) -> float:
-        """Start it with as many open files as the unit allows; returns when."""
+        """Start it with the unit's limit on open files; return when."""
         return self._start("bench.control.watched", str(self._turns), "--config", str(self._config))
 
     def start_bare(self, *what: str) -> float:
-        """Start the anchor in its place; `what` it is told beside port and certificate."""
+        """Start the anchor in its place; `what` are its arguments besides port and certificate."""
         return self._start("bench.control.bare", str(self._port), str(self._tls), *what)
 
     def _start(self, module: str, *arguments: str) -> float:
@@ -104,31 +104,31 @@ class Plane:
         began = time.monotonic()
         with (self._folder / "controlplane.log").open("ab") as log:
             self._process = subprocess.Popen(command, stdout=log, stderr=log, env=self._environment)
-        # Not between fork and exec: gRPC's threads of this process would be missing there.
+        # Set from outside, not between fork and exec: gRPC's threads of this process would be missing there.
         resource.prlimit(self._process.pid, resource.RLIMIT_NOFILE, (limit, limit))
         return began
 
     def kill(self) -> None:
-        """SIGKILL, as when the power goes."""
+        """Send SIGKILL, as if the power failed."""
         assert self._process is not None
         self._process.kill()
         self._process.wait()
 
     def lose_first_server(self) -> None:
-        """Tell the anchor."""
+        """Signal the anchor that its first server is dead."""
         os.kill(self.pid, signal.SIGUSR2)
 
     def processor_s(self) -> float:
-        """Processor time it has used."""
+        """Return the processor time that it has used."""
         return processor_s(self.pid)
 
     def resident_kb(self) -> int:
-        """Memory it holds."""
+        """Return the memory that it holds."""
         text = Path(f"/proc/{self.pid}/status").read_text()
         return int(text.partition("VmRSS:")[2].split()[0])
 
     def hold(self) -> Hold:
-        """The longest turn of its event loop since the last look."""
+        """Return the longest turn of its event loop since the last call."""
         self._turns.unlink(missing_ok=True)
         os.kill(self.pid, signal.SIGUSR1)
         give_up_at = time.monotonic() + PATIENCE_S
@@ -141,13 +141,13 @@ class Plane:
         return Hold(found["cpu_s"], found["wall_s"], what)
 
     def metric(self, name: str) -> float:
-        """The value of a series, with its labels as they are written."""
+        """Return the value of a series, named with its labels as they are written."""
         with urlopen(f"http://127.0.0.1:{self._metrics_port}/metrics", timeout=PATIENCE_S) as answer:
             lines = answer.read().decode().splitlines()
         return sum(float(line.rpartition(" ")[2]) for line in lines if line.startswith(f"{name} "))
 
     def status_s(self) -> float:
-        """How long `plr status` takes, from its start to its end."""
+        """Return how long `plr status` takes, from start to end."""
         command = [sys.executable, "-m", "controlplane.cli", "status", "--address", self.target]
         began = time.monotonic()
         subprocess.run(
@@ -157,7 +157,7 @@ class Plane:
 
 
 def open_files_of(unit: Path) -> int:
-    """Return how many files a systemd unit lets its program have open."""
+    """Return how many open files a systemd unit allows its program."""
     parser = configparser.RawConfigParser(strict=False)
     parser.read_string(unit.read_text())
     return int(parser.get("Service", "LimitNOFILE", fallback=USUAL_OPEN_FILES))

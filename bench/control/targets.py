@@ -1,4 +1,4 @@
-"""What the control plane's figures are held against; each for fleets of several sizes, from one run."""
+"""Defines the targets of the control plane's figures, each for fleets of several sizes, from one run."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ LOOP_HOLD_MS = {1000: 20, 4000: 50}
 
 
 def targets(sizes: tuple[int, ...] = SIZES) -> tuple[Target, ...]:
-    """The targets of fleets of these sizes."""
+    """Return the targets of fleets of these sizes."""
     found: list[Target] = []
     for size in sizes:
         if size in REGISTERED_S:

@@ -1,8 +1,8 @@
 """Runs the real control plane, and notes how long each turn of its event loop held it.
 
 `python -m bench.control.watched FILE --config ...` starts `plr-controlplane` with these arguments. On SIGUSR1 it writes
-what it noted since the last time to FILE, as one JSON object: the longest turns, in seconds of the loop's processor
-time and of the clock. A shared machine stretches the latter.
+its notes since the last signal to FILE, as one JSON object: the longest turns, in seconds of the loop's processor time
+and of the clock. A shared machine stretches the latter.
 """
 
 from __future__ import annotations
@@ -21,20 +21,20 @@ from controlplane.__main__ import main as controlplane_main
 
 KEPT = 20
 NOTED_FROM_S = 0.002
-"""Shorter turns are of no interest, and naming them would cost more than they do."""
+"""Shortest turn noted: shorter ones are of no interest, and naming them would cost more than they take."""
 CLOCK_READ_S = 0.0005
-"""By so much a turn may seem longer than it is: the turns before it since the processor's clock was read."""
+"""How much longer than it is a turn may seem: by the turns before it since the processor's clock was read."""
 
 
 class Turns:
-    """The longest turns since the last look."""
+    """The longest turns since they were last written."""
 
     def __init__(self, file: Path) -> None:
         self._file = file
         self._worst: list[tuple[float, float, str]] = []
 
     def note(self, cpu_s: float, wall_s: float, handle: Any) -> None:
-        """One turn has ended."""
+        """Note the end of a turn."""
         item = (cpu_s, wall_s, describe(handle))
         if len(self._worst) < KEPT:
             heapq.heappush(self._worst, item)
@@ -42,7 +42,7 @@ class Turns:
             heapq.heappushpop(self._worst, item)
 
     def write(self) -> None:
-        """Write them to the file, whole or not at all, and begin anew."""
+        """Write them to the file, whole or not at all, and start over."""
         worst, self._worst = sorted(self._worst, reverse=True), []
         found = {
             "cpu_s": max((cpu for cpu, _, _ in worst), default=0.0),
@@ -55,7 +55,7 @@ class Turns:
 
 
 def describe(handle: Any) -> str:
-    """Name what a turn ran: a task by its coroutine."""
+    """Return the name of what a turn ran, for a task that of its coroutine."""
     callback = handle._callback
     owner = getattr(callback, "__self__", None)
     if isinstance(owner, asyncio.Task):
@@ -68,7 +68,7 @@ def watch(turns: Turns) -> None:
     run = asyncio.events.Handle._run  # there is no public hook
     clock, processor = time.perf_counter, time.thread_time
     looked, spent = clock(), processor()
-    """When the processor's clock was read, which takes six times as long as the other: not for each turn."""
+    """When the processor's clock was last read. It takes six times as long as the other, so not each turn reads it."""
 
     def timed(handle: Any) -> None:
         nonlocal looked, spent
@@ -80,11 +80,11 @@ def watch(turns: Turns) -> None:
         if wall_s >= NOTED_FROM_S:
             turns.note(processor() - spent, wall_s, handle)
 
-    setattr(asyncio.events.Handle, "_run", timed)  # noqa: B010 - a method, which mypy lets nobody replace
+    setattr(asyncio.events.Handle, "_run", timed)  # noqa: B010 - mypy forbids to replace a method
 
 
 def main() -> int:
-    """Command line."""
+    """Run the command line."""
     turns = Turns(Path(sys.argv[1]))
     watch(turns)
     signal.signal(signal.SIGUSR1, lambda *_: turns.write())
