@@ -1,1 +1,1 @@
-"""A day in the life of a fleet, in simulated time: the control plane's core and a thousand sidecars' ends of it."""
+"""Simulates a day in the life of a fleet: the control plane's core and the control streams of a thousand sidecars."""

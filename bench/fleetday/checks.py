@@ -1,9 +1,9 @@
-"""What must hold at any time between a fleet and its control plane; whoever has had no reason to lag is judged.
+"""Checks what must always hold between a fleet and its control plane, for all members with no reason to lag.
 
-- What a sidecar holds is what the control plane believes that it took, and what is true of the others.
-- Nobody is owed the same version for long.
-- No mapping names a server that has been gone for long, or an interface.
-- The registry has those who are there, and nobody else for long.
+- A sidecar holds what the control plane believes that it took, and what is true of the others.
+- No member is owed the same version for long.
+- No mapping names a server or an interface that has been gone for long.
+- The registry holds the members that are there, and no others for long.
 """
 
 from __future__ import annotations
@@ -29,17 +29,17 @@ if TYPE_CHECKING:
     from protos.model.members import Peer
 
 SETTLES_S = 60.0
-"""After a change of a member, or of what keeps it from hearing of one, until all who can hear of it have: twice the
+"""Time after a change of a member, or of its reachability, until all that can learn of the change have: twice the
 longest lease."""
 
 GONE_S = 90.0
-"""After a member's end until nobody healthy knows it any more: the longest lease, and the same."""
+"""Time after a member's end until no healthy one knows it any more: the longest lease on top of SETTLES_S."""
 
 STARTS_S = 120.0
-"""After a start of the control plane until everybody is back and everything is told."""
+"""Time after a start of the control plane until all members are back and everything is sent."""
 
 MAX_COMPLAINTS = 200
-"""Kept; the others are counted."""
+"""Complaints kept; the others are only counted."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,28 +48,28 @@ class Belief:
 
     state: SyncState
     version: Version
-    """Sent last."""
+    """Version sent last."""
 
 
 def believed(core: ControlCore, name: NodeName, resource: ResourceKind) -> Belief:
-    """How far the control plane believes that a sidecar follows."""
+    """Return how far the control plane believes that a sidecar follows."""
     track = core._publisher[name].track(resource)
     return Belief(track.state, track.version_sent)
 
 
 def believed_peers(core: ControlCore, name: NodeName) -> Mapping[NodeName, Peer] | None:
-    """The peers that the control plane believes a sidecar was sent last, with their own tokens."""
+    """Return the peers that the control plane believes it sent a sidecar last, with their own tokens."""
     sent = core._publisher[name].peers.sent
     return {peer.name: peer for peer in sent.peers} if sent is not None else None
 
 
 def believed_mapping(core: ControlCore, name: NodeName) -> tuple[ServiceMapping, ...] | None:
-    """The mapping that the control plane believes a robot was sent last."""
+    """Return the mapping that the control plane believes it sent a robot last."""
     return core._publisher[name].mapping.sent
 
 
 class Checker:
-    """Compares the two sides, look after look, and keeps what is wrong."""
+    """Compares the two sides repeatedly, and keeps what is wrong."""
 
     def __init__(self, plane: Plane, members: Mapping[NodeName, Member]) -> None:
         self._plane = plane
@@ -78,16 +78,16 @@ class Checker:
         self.complaints_in_all = 0
         self.looks = 0
         self.judged = 0
-        """Sidecars that were found healthy, in all looks together."""
+        """Sidecars found healthy, summed over all comparisons."""
         self.compared = 0
-        """Entries of peers that were compared, with the belief or the truth."""
+        """Entries of peers compared with the belief or the truth."""
         self.policy_at = float("-inf")
-        """When another policy came into force."""
+        """When the policy last changed."""
         self._owed: dict[tuple[NodeName, ResourceKind], tuple[Version, float]] = {}
-        """Versions that were not taken at an earlier look, and since when."""
+        """Versions that an earlier comparison found not taken, and since when."""
 
     def look(self, now: float) -> int:
-        """Compare everything; returns how many sidecars were judged."""
+        """Compare everything; return how many sidecars were judged."""
         self.looks += 1
         if not self._plane.up:
             return 0
@@ -121,7 +121,7 @@ class Checker:
             self.complaints.append(f"{now / 3600.0:.3f} h: {text}")
 
     def _belief(self, core: ControlCore, member: Member, now: float) -> None:
-        """What is taken for synced is in force there, and is what was sent."""
+        """Check that what counts as synced is in force at the member, and is what was sent."""
         known = core.registry.get(member.name)
         if known is None or not member.alive or known.registration.session != member.session_id:
             return
@@ -182,7 +182,7 @@ class Checker:
                 self._complain(now, f"{holder.name} holds {other.name} with other calls than the policy's")
 
     def _owes(self, core: ControlCore, member: Member, resource: ResourceKind, now: float) -> None:
-        """Nobody healthy is owed the same version for longer than it takes."""
+        """Check that no healthy member is owed the same version for too long."""
         key = member.name, resource
         if core.registry.get(member.name) is None:
             return
@@ -212,17 +212,17 @@ class Checker:
 
 
 def is_healthy(member: Member, now: float) -> bool:
-    """Whether nothing has kept it for a while from holding what it should."""
+    """Return whether nothing has recently kept a member from holding what it should."""
     return member.online and not (member.refuses or member.slow or member.draining) and now - member.ill_at >= SETTLES_S
 
 
 def is_gone(member: Member, now: float) -> bool:
-    """Whether everybody should know that it is not there."""
+    """Return whether all should know by now that a member is gone."""
     return not member.alive and now - member.changed_at >= GONE_S
 
 
 def _said(peer: Peer) -> tuple[object, ...]:
-    """All of a peer but its token."""
+    """Return everything of a peer except its token."""
     return (
         *(peer.name, peer.role, peer.session, peer.incarnation, peer.candidates, peer.offers, peer.draining),
         *(peer.credential, peer.may_call, peer.candidates_serial, peer.candidates_signature),
@@ -230,12 +230,12 @@ def _said(peer: Peer) -> tuple[object, ...]:
 
 
 def _routes(mapping: tuple[ServiceMapping, ...]) -> list[object]:
-    """A mapping without its prediction, which is rounded on its way."""
+    """Return a mapping without its prediction, which is rounded in transit."""
     return [(one.service, one.assignments, one.reason, one.explore) for one in mapping]
 
 
 def _is_as(peer: Peer, member: Member) -> bool:
-    """Whether this is what a member says of itself, whichever of its offers are told."""
+    """Return whether this matches what a member says of itself, whichever of its offers are sent."""
     return (
         (peer.session, peer.incarnation, peer.credential) == (member.session_id, member.incarnation, member.credential)
         and peer.candidates == member.candidates.candidates
@@ -246,7 +246,7 @@ def _is_as(peer: Peer, member: Member) -> bool:
 
 
 def _concerned(policy: Policy | None, one: Member, other: Member) -> bool:
-    """Whether the policy leaves the two something to do with what the cloud offers now."""
+    """Return whether the policy leaves the two anything to do with each other, given the cloud's present offers."""
     if policy is None:
         return True
     robot, cloud = (one, other) if one.role is Role.ROBOT else (other, one)
@@ -254,7 +254,7 @@ def _concerned(policy: Policy | None, one: Member, other: Member) -> bool:
 
 
 def _may(policy: Policy | None, holder: Member, other: Member, peer: Peer) -> bool:
-    """Whether the holder is told of the calls that the policy of now allows, and of no others."""
+    """Return whether the holder was sent exactly the calls that the current policy allows."""
     if holder.role is Role.CLOUD:
         if policy is None:
             return peer.may_call.everything

@@ -18,11 +18,11 @@ if TYPE_CHECKING:
     import argparse
 
 SHOWN_TABLES = 40
-"""The largest ones."""
+"""Tables shown, the largest ones."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Options of `python -m bench fleet-day`."""
+    """Add the options of `python -m bench fleet-day`."""
     whole = Scale()
     parser.add_argument("--members", type=int, default=whole.members, help="sidecars (default %(default)s)")
     parser.add_argument("--hours", type=float, default=whole.hours, help="simulated hours (default %(default)s)")
@@ -34,7 +34,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    """Live through the day and write fleet-day.json; returns the exit code: 1 when anything drifted or grew."""
+    """Run through the day, write fleet-day.json and return the exit code: 1 if anything drifted or grew."""
     console = Console(highlight=False, soft_wrap=True)
     scale = Scale(members=options.members, hours=options.hours, every_hours=options.hours / 6.0)
     if options.trace_memory:
@@ -92,7 +92,7 @@ def run(options: argparse.Namespace) -> int:
 
 
 def _show_tables(console: Console, samples: list[Sample]) -> None:
-    """Entries of the largest tables, and bytes below each attribute of the core, at each measurement."""
+    """Show the entries of the largest tables, and bytes below each attribute of the core, at each measurement."""
     console.print("entries of the core's tables at " + ", ".join(f"{sample.at_h:g} h" for sample in samples))
     names = {name for sample in samples for name in sample.sizes.entries}
     largest = sorted(names, key=lambda name: -max(sample.sizes.entries.get(name, 0) for sample in samples))

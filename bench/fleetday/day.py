@@ -1,4 +1,4 @@
-"""The day: who comes, goes, moves and breaks when, drawn from a seed, and the looks at it in between."""
+"""Plays the day: members come, go, move and break at times drawn from a seed, and are compared in between."""
 
 from __future__ import annotations
 
@@ -34,17 +34,17 @@ if TYPE_CHECKING:
 
 HOUR_S = 3600.0
 START = 1000.0
-"""Simulated time begins here."""
+"""Start of simulated time."""
 
 QUIET_S = 240.0
-"""Before each measurement nothing new happens for so long: longer than any spell, lease and settling together."""
+"""Quiet time before each measurement: longer than any spell, lease and settling together."""
 
 RESTARTS_UNTIL = 0.3
-"""Of the day: one control plane runs through the rest of it, so that what grows does so for long; it is killed at the
-end once more."""
+"""Share of the day with restarts. One control plane runs through the rest, so that anything that grows has long to do
+so; it is killed once more at the end."""
 
 SPELL_S = (20.0, 100.0)
-"""How long somebody refuses, reads slowly or has no network."""
+"""How long a member refuses, reads slowly or has no network."""
 
 SERVICES = tuple(ServiceName(name) for name in ("/plan", "/detect", "/grasp", "/map"))
 TYPE = "nav_msgs/srv/GetPlan"
@@ -52,8 +52,8 @@ DEADLINES_S = (0.125, 0.25, 0.5)
 WLAN, WWAN, WIRED = (InterfaceName(name) for name in ("wlan0", "wwan0", "eth0"))
 
 GROWTH_SHARE = 0.3
-"""By which a table may be larger in the second half of a day than in the first, beside some slack: who is there differs
-from hour to hour."""
+"""Share by which a table may be larger in the second half of a day than in the first, besides some slack: the members
+differ from hour to hour."""
 
 CAPPED = {
     "departed._departures": MAX_DEPARTED,
@@ -71,7 +71,7 @@ CAPPED = {
     "_publisher._gone": MAX_GONE_SNAPSHOTS,
     "estimator._compute._servers": MAX_PROCESSING,
 }
-"""What is remembered of those who are gone, for as many."""
+"""Tables that remember departed members, with their caps."""
 
 POLICIES: tuple[Policy | None, ...] = (
     None,
@@ -83,38 +83,38 @@ POLICIES: tuple[Policy | None, ...] = (
 
 @dataclass(frozen=True, slots=True)
 class Scale:
-    """How large and how long."""
+    """The size and length of a day."""
 
     members: int = 1000
     hours: float = 24.0
     every_hours: float = 4.0
-    """From one measurement of all tables to the next."""
+    """Interval between measurements of all tables."""
     moment_s: float = 60.0
-    """From one moment, at which something happens, to the next, in the mean."""
+    """Mean interval between moments at which something happens."""
     events: int = 16
-    """The most that begins at one moment; how it ends is drawn apart."""
+    """Most events that begin at one moment; their ends are drawn separately."""
     grid_s: float = 20.0
-    """What ends does so within a second after a multiple of this: it costs less to solve and publish for it together;
-    0: at any time."""
+    """Events end within a second after a multiple of this, since solving and publishing for them together costs less;
+    0 means at any time."""
     solving_s: float = 0.004
-    """What the matcher takes for each block in simulated time: as if it had a small part of a processor."""
+    """Simulated time that the matcher takes for each block, as if it had a small part of a processor."""
     look_s: float = 300.0
-    """From one comparison of the two sides to the next."""
+    """Interval between comparisons of the two sides."""
     measures_s: float = 300.0
-    """From one measurement of a robot to its next; what else it reports is that paths went up or down."""
+    """Interval between measurements of a robot; its other reports say that paths went up or down."""
     slack: int = 200
-    """Entries by which a table may differ."""
+    """Entries by which a table may grow in any case."""
     restarts: int = 6
-    """Of the control plane."""
+    """Restarts of the control plane."""
 
 
 @dataclass(frozen=True, slots=True)
 class Sample:
-    """The control plane at one time, after a quiet while."""
+    """The control plane at one time, after a quiet period."""
 
     at_h: float
     run: int
-    """Of the control plane, which was started so often."""
+    """Number of the control plane's run."""
     registered: int
     judged: int
     sizes: Sizes
@@ -144,7 +144,7 @@ class Day:
         self._quiet = False
         self._crls = 0
         self.judged_at_last = 0
-        """Sidecars judged after the control plane was killed at the end of the day."""
+        """Sidecars judged after the kill of the control plane at the end of the day."""
         weights: tuple[tuple[int, Callable[[], None]], ...] = (
             (25, self.rebinds),
             (15, self.loses_an_interface),
@@ -170,7 +170,7 @@ class Day:
 
     @property
     def clouds_wanted(self) -> int:
-        """Servers of the fleet."""
+        """Number of servers of the fleet."""
         return max(4, self.scale.members // 80)
 
     def _join(self, role: Role) -> Member:
@@ -195,7 +195,7 @@ class Day:
         return member
 
     def _addresses(self) -> tuple[Address, Address]:
-        """A new host address, and where a NAT shows it."""
+        """Return a new host address, and its address behind a NAT."""
         self._address += 1
         number = self._address
         inside = f"10.{number >> 16 & 255}.{number >> 8 & 255}.{number & 255}"
@@ -231,7 +231,7 @@ class Day:
     # ── what happens to a member ──
 
     def rebinds(self) -> None:
-        """A NAT forgets a binding: another address and port, as STUN tells a moment later."""
+        """Make a NAT forget a binding: another address and port follow, as STUN finds a moment later."""
         robot = self._someone(Role.ROBOT)
         if robot.interfaces:
             interface = self.rng.choice(list(robot.interfaces))
@@ -239,7 +239,7 @@ class Day:
             robot.set_interfaces({**robot.interfaces, interface: (inside, self._addresses()[1])})
 
     def loses_an_interface(self) -> None:
-        """An interface vanishes, and is back some time later with another address."""
+        """Take an interface away, to return some time later with another address."""
         robot = self._someone(Role.ROBOT)
         if len(robot.interfaces) < 2:
             return
@@ -252,7 +252,7 @@ class Day:
         self._later(5.0, 600.0, back)
 
     def path_goes_dark(self) -> None:
-        """An interface, or one path of it, carries nothing for a while."""
+        """Make an interface, or one path of it, carry nothing for a while."""
         robot = self._someone(Role.ROBOT)
         if not robot.interfaces:
             return
@@ -270,15 +270,15 @@ class Day:
         self._later(2.0, 300.0, lit)
 
     def breaks(self) -> None:
-        """A stream is reset."""
+        """Reset a stream."""
         self._someone().break_line(half_open=False)
 
     def goes_half_open(self) -> None:
-        """A stream dies without a word."""
+        """Let a stream die silently."""
         self._someone().break_line(half_open=True)
 
     def loses_its_network(self) -> None:
-        """Neither the stream nor a new one gets through."""
+        """Block a member's stream and any new one."""
         member = self._someone()
         member.network_down = True
         member.break_line(half_open=True)
@@ -289,7 +289,7 @@ class Day:
         self._later(*SPELL_S, back)
 
     def crashes(self) -> None:
-        """A robot's sidecar, or all of it, dies and is back soon."""
+        """Crash a robot's sidecar, or the whole robot; it is back soon."""
         self._down(self._someone(Role.ROBOT), 1.0, 1800.0)
 
     def _down(self, member: Member, least_s: float, most_s: float) -> None:
@@ -301,7 +301,7 @@ class Day:
             member.start(keeps_disk=self.rng.random() < 0.7)
 
     def leaves(self) -> None:
-        """A robot says goodbye; it is back for its next shift, or another one comes for it."""
+        """Let a robot say goodbye; it is back for its next shift, or another one replaces it."""
         self._goes(self._someone(Role.ROBOT))
 
     def _goes(self, member: Member) -> None:
@@ -316,28 +316,28 @@ class Day:
             self._replaced(member)
 
     def _replaced(self, member: Member) -> None:
-        """It never comes back, and another one comes for it."""
+        """Replace a member that never comes back by another one."""
         self._later(30.0, 1200.0, lambda: self._join_for(member))
 
     def _join_for(self, gone: Member) -> None:
-        # Kept until now for those who look who is gone.
+        # Kept until now for checks of who is gone.
         self.members.pop(gone.name, None)
         self._join(gone.role)
 
     def server_dies(self) -> None:
-        """A server and its host die."""
+        """Let a server and its host die."""
         clouds = self._alive(Role.CLOUD)
         if 3 * len(clouds) > 2 * self.clouds_wanted:
             self._down(self.rng.choice(clouds), 5.0, 900.0)
 
     def server_leaves(self) -> None:
-        """A server is taken out of service; often another one, of another name, comes for it."""
+        """Take a server out of service; often another one, of another name, replaces it."""
         clouds = self._alive(Role.CLOUD)
         if 3 * len(clouds) > 2 * self.clouds_wanted:
             self._goes(self.rng.choice(clouds))
 
     def changes_services(self) -> None:
-        """A robot carries others, or a server offers others."""
+        """Change the services that a robot carries, or that a server offers."""
         member = self._someone(Role.CLOUD if self.rng.random() < 0.2 else Role.ROBOT)
         member.set_services(self._services(member.role))
 
@@ -351,16 +351,16 @@ class Day:
         self._later(*SPELL_S, over)
 
     def refuses(self) -> None:
-        """A sidecar takes nothing for a while, as its driver hangs."""
+        """Make a sidecar take nothing for a while, as if its driver hung."""
         self._spell(self._someone(), "refuses")
 
     def refuse_all(self) -> None:
-        """Nobody takes anything any more."""
+        """Make every sidecar refuse everything from now on."""
         for member in self._alive():
             member.refuses = True
 
     def reads_slowly(self) -> None:
-        """A sidecar behind a bad link takes seconds for a message."""
+        """Make a sidecar take seconds for a message, as if behind a bad link."""
         member = self._someone()
         self._spell(member, "slow")
         if member.line is not None:
@@ -373,17 +373,17 @@ class Day:
             self._later(*SPELL_S, over)
 
     def stalls(self) -> None:
-        """A sidecar reads nothing for a minute, and is heard all the while."""
+        """Make a sidecar read nothing for a minute, while it is still heard."""
         member = self._someone()
         member.stall(60.0)
         self._spell(member, "slow")
 
     def renews(self) -> None:
-        """A new certificate, with which the stream begins anew."""
+        """Give a member a new certificate, with which its stream restarts."""
         self._someone().renew_credential()
 
     def is_revoked(self) -> None:
-        """A certificate is revoked, or has ended."""
+        """Revoke a certificate, or let it expire."""
         member = self._someone(Role.ROBOT)
         ended = self.rng.random() < 0.5
         self._crls += not ended
@@ -403,7 +403,7 @@ class Day:
     # ── what happens to all ──
 
     def restart_plane(self) -> None:
-        """The control plane stops or dies, and is back soon; now and then with a clock that was set back."""
+        """Stop or kill the control plane, which is back soon, sometimes with a clock that was set back."""
         if self._quiet or not self.plane.up:
             self._later(QUIET_S, 2 * QUIET_S, self.restart_plane)
             return
@@ -414,7 +414,7 @@ class Day:
         self._later(0.5, 40.0, self.plane.start)
 
     def change_policy(self) -> None:
-        """Another policy is in force for a while; then none."""
+        """Put another policy into force for a while; then none."""
         if self._quiet:
             self._later(QUIET_S, 2 * QUIET_S, self.change_policy)
             return
@@ -433,7 +433,7 @@ class Day:
         self.plane.set_policy(policy)
 
     def outage(self) -> None:
-        """The network in front of the control plane dies for a minute: all streams at once, without a word."""
+        """Cut the network in front of the control plane for a minute: all streams die at once, silently."""
         if self._quiet:
             self._later(QUIET_S, 2 * QUIET_S, self.outage)
             return
@@ -452,7 +452,7 @@ class Day:
     # ── the day ──
 
     def begin(self) -> None:
-        """Start the control plane and the fleet, and draw when what concerns all happens."""
+        """Start the control plane and the fleet, and draw the times of events that concern all."""
         self.plane.start()
         for number in range(self.scale.members):
             role = Role.CLOUD if number < self.clouds_wanted else Role.ROBOT
@@ -497,13 +497,13 @@ class Day:
                 core.explain(name, known.uses[0].name, now)
 
     def _busy(self) -> None:
-        """What the control plane's processor does: more by day than by night, and too much for some minutes."""
+        """Vary the load of the control plane's processor: more by day than by night, and too much for some minutes."""
         hour = (self.timeline.now - START) / HOUR_S
         self.plane.busy = 0.3 - 0.25 * math.cos(hour / 24.0 * 2 * math.pi) + (0.4 if self.rng.random() < 0.2 else 0.0)
         self.timeline.after(300.0, self._busy)
 
     def run(self) -> None:
-        """The whole day, with a measurement at the end of each part of it."""
+        """Run the whole day, with a measurement at the end of each part."""
         self.begin()
         parts = round(self.scale.hours / self.scale.every_hours)
         for part in range(1, parts + 1):
@@ -520,14 +520,14 @@ class Day:
         self.judged_at_last = self.checker.look(self.timeline.now)
 
     def grown(self) -> list[str]:
-        """Tables of the control plane that ran longest which grew with time."""
+        """Return the tables that grew over time in the control plane that ran longest."""
         run = self.plane.starts - 1
         sizes = [sample.sizes for sample in self.samples if sample.run == run]
         return grown(sizes, share=GROWTH_SHARE, slack=self.scale.slack, capped=CAPPED)
 
     @property
     def last_members(self) -> int:
-        """Sidecars that are there at the end."""
+        """Number of sidecars present at the end."""
         return len(self._alive())
 
     def _sample(self) -> None:
@@ -549,7 +549,7 @@ class Day:
         self.on_sample(sample)
 
     def healthy(self) -> int:
-        """Sidecars that have no reason to lag."""
+        """Return how many sidecars have no reason to lag."""
         return sum(is_healthy(member, self.timeline.now) for member in self.members.values())
 
 

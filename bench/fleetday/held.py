@@ -1,6 +1,6 @@
-"""What a sidecar holds after it has applied what it was sent: its peers and its mapping.
+"""Tracks what a sidecar holds after it has applied what it was sent: its peers and its mapping.
 
-How a message changes that stands in `HeldPeers.apply` alone; whoever checks asks for the table.
+Only `HeldPeers.apply` knows how a message changes that; checks use the table.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ class HeldPeers:
         self._table: dict[NodeName, Peer] | None = {}
 
     def apply(self, message: PeerSet) -> None:
-        """Put it in force. A set is whole, and read when somebody asks: few sets of a large fleet ever are."""
+        """Put a set into force. A whole set is read only on demand: few sets of a large fleet ever are."""
         self.version = message.version
         self._told = message.peers
         self._table = None
@@ -40,7 +40,7 @@ class HeldPeers:
 
 
 class Held:
-    """Everything that is in force at one sidecar; survives its restarts if its disk does."""
+    """Everything in force at one sidecar; it survives restarts if the disk does."""
 
     def __init__(self) -> None:
         self.peers = HeldPeers()

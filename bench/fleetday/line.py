@@ -1,4 +1,4 @@
-"""One control stream in simulated time: it delays, stalls, breaks, and dies without a word."""
+"""Simulates one control stream: it delays, stalls, breaks, and dies silently."""
 
 from __future__ import annotations
 
@@ -27,21 +27,20 @@ if TYPE_CHECKING:
     from protos.model.stream import ControlMessage, SidecarMessage
 
 IN_FLIGHT = 2
-"""Messages that a connection's buffers hold; what else is to be written waits in the mailbox, where newer ones come in
-the place of older ones."""
+"""Messages that a connection's buffers hold; the others wait in the mailbox, where newer ones replace older ones."""
 
 CONVERTED_ONE_IN = 20
-"""Messages that take the way through protobuf; the others are handed over as they are."""
+"""One in this many messages goes through protobuf; the others are handed over as they are."""
 
 FEW_PEERS, LARGE_CONVERTED_ONE_IN = 50, 400
-"""Sets of more peers take some milliseconds."""
+"""The same for sets of more than a few peers, which take some milliseconds."""
 
 _NOT_ANSWERED_SOON = frozenset({CloseReason.REPLACED, CloseReason.REVOKED, CloseReason.CERTIFICATE_ENDED})
-"""Endings whose gRPC status is among the sidecar's REFUSALS."""
+"""Reasons to close whose gRPC status is among the sidecar's REFUSALS."""
 
 
 class Line:
-    """A stream between one sidecar and the control plane; each end has its own belief of whether it is there."""
+    """A stream between one sidecar and the control plane; each end has its own belief of whether it is open."""
 
     def __init__(self, timeline: Timeline, plane: Plane, member: Member, rng: random.Random) -> None:
         self._timeline = timeline
@@ -52,23 +51,23 @@ class Line:
         self._mailbox = Mailbox()
         self._in_flight = 0
         self._read_at = 0.0
-        """When the sidecar reads what was written last."""
+        """When the sidecar reads the message written last."""
         self._stream: StreamId | None = None
         self.dead = False
-        """Nothing arrives any more, at either end."""
+        """Whether nothing arrives at either end any more."""
         self.slow_s = 0.0
-        """What the sidecar takes to read a message, in seconds beside the delay."""
+        """Time that the sidecar takes to read a message, in seconds on top of the delay."""
         self.stalled_until = 0.0
-        """The sidecar reads nothing before."""
+        """Time before which the sidecar reads nothing."""
 
     # ── the sidecar's end ──
 
     def say(self, message: SidecarMessage) -> None:
-        """The sidecar writes a message."""
+        """Write a message of the sidecar."""
         if self.dead:
             return
         if isinstance(message, Heartbeat):
-            # One in a thousand would matter for its delay; they are most of what a fleet says.
+            # The delay matters for one in a thousand of these, and they are most of a fleet's messages.
             if self._stream is not None and self._plane.up:
                 self._plane.beat(self._stream, message)
             return
@@ -77,13 +76,13 @@ class Line:
         self._timeline.after(self._delay_s, partial(self._heard, message))
 
     def hang_up(self) -> None:
-        """The sidecar ends the stream; the control plane learns of it, if anything arrives there."""
+        """End the stream at the sidecar; the control plane learns of it if anything arrives there."""
         if not self.dead:
             self._timeline.after(self._delay_s, self._lost)
         self.dead = True
 
     def cut(self) -> None:
-        """The connection is reset: both ends learn of it now."""
+        """Reset the connection: both ends learn of it now."""
         self.dead = True
         self._lost()
         self._member.line_ended(self, refused=False)
@@ -104,12 +103,12 @@ class Line:
             self._plane.receive(self._stream, message)
 
     def put(self, message: ControlMessage) -> None:
-        """The control plane has something to say."""
+        """Write a message of the control plane."""
         self._mailbox.put(message)
         self._write()
 
     def close(self, reason: CloseReason) -> None:
-        """The control plane ends the stream."""
+        """End the stream at the control plane."""
         self._mailbox.close(reason)
         self._write()
 
@@ -142,12 +141,12 @@ class Line:
         self.dead = True
 
     def _lost(self) -> None:
-        """The control plane's end of it ends."""
+        """End the control plane's side of the stream."""
         if self._stream is not None:
             self._plane.disconnected(self._stream)
             self._stream = None
 
     @property
     def superseded(self) -> int:
-        """Messages that a newer one replaced before they were written."""
+        """Messages replaced by a newer one before they were written."""
         return self._mailbox.superseded

@@ -1,4 +1,4 @@
-"""One sidecar: what is true of it, its end of the control stream, and what it holds."""
+"""Simulates one sidecar: its true state, its end of the control stream, and what it holds."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from protos.model.stream import ControlMessage
 
 NOTICES_S = (10.0, 40.0)
-"""Keepalives find a connection that died without a word within this time."""
+"""Range of the time in which keepalives find a connection that died silently."""
 
 NOTHING = Report()
 _EMPTY = Histogram()
@@ -42,7 +42,7 @@ def _histograms(rng: random.Random, count: int, middle_s: float) -> list[Histogr
 
 
 class Measurements:
-    """What robots may measure, drawn once for all of them."""
+    """Possible measurements of robots, drawn once for all of them."""
 
     def __init__(self, rng: random.Random) -> None:
         self.round_trips = _histograms(rng, 64, 0.04)
@@ -51,7 +51,7 @@ class Measurements:
 
 
 class Member:
-    """A robot or a cloud, from its first start on; over its restarts it is the same one."""
+    """A robot or a cloud from its first start on; it stays the same across restarts."""
 
     def __init__(
         self,
@@ -80,7 +80,7 @@ class Member:
         self.session_id = SessionId(0)
         self.credential = b""
         self.interfaces: dict[InterfaceName, tuple[Address, ...]] = {}
-        """Those that are there, with the addresses under which each is reached."""
+        """Present interfaces, with the addresses at which each is reached."""
         self._ids: dict[InterfaceName, InterfaceId] = {}
         self.candidates = CandidateSet()
         self.services = ServiceSet()
@@ -90,12 +90,12 @@ class Member:
         self.session: ControlSession | None = None
         self.line: Line | None = None
         self.network_down = False
-        """New streams get nowhere."""
+        """Whether new streams cannot get through."""
         self.refuses = False
-        """It takes nothing that it is sent."""
+        """Whether it refuses everything that it is sent."""
         self.slow = False
         self.changed_at = timeline.now
-        """When anything that others are to know of it changed last."""
+        """When anything that others must know of it last changed."""
         self.ill_at = timeline.now
         """When it last had a reason not to hold what it should."""
         self.dark: set[InterfaceName | tuple[InterfaceName, NodeName]] = set()
@@ -104,18 +104,18 @@ class Member:
         """Interfaces that went away, and when."""
         self._paths_due = False
         self._told_up: dict[tuple[InterfaceName, NodeName], bool] = {}
-        """Whether each path was up when it was told last."""
+        """Whether each path was up when last reported."""
         self._measure_at = 0.0
         self._wake_at = float("inf")
         self.complaints: list[str] = []
-        """What no sidecar should ever see."""
+        """Observations that no sidecar should ever make."""
         self.applied = 0
         self.refused = 0
 
     # ── life ──
 
     def start(self, *, keeps_disk: bool) -> None:
-        """The process starts: a new session, which holds what is on the disk."""
+        """Start the process: a new session, which holds what is on the disk."""
         if not keeps_disk:
             self.held = Held()
         self.incarnation += 1
@@ -130,7 +130,7 @@ class Member:
         self._schedule()
 
     def registration(self) -> Registration:
-        """What it says of itself first."""
+        """Return its registration."""
         return Registration(
             PROTOCOL_VERSION,
             self.name,
@@ -146,7 +146,7 @@ class Member:
         )
 
     def crash(self, *, silently: bool) -> None:
-        """The process ends; `silently`: its host does, so that nobody hears of it before the lease ends."""
+        """End the process; `silently` with its host, so that nobody learns of it before the lease ends."""
         self.alive = False
         self._wake_at = float("inf")
         line, self.line = self.line, None
@@ -157,7 +157,7 @@ class Member:
         self._fell_ill()
 
     def drain(self) -> None:
-        """Say goodbye; `crash` follows when what was in flight is done."""
+        """Say goodbye; `crash` follows once requests in flight are done."""
         assert self.session is not None
         self.draining = True
         self.session.drain()
@@ -165,7 +165,7 @@ class Member:
         self._say()
 
     def renew_credential(self) -> None:
-        """A new certificate: the stream is opened anew with it."""
+        """Take a new certificate: the stream is reopened with it."""
         self.credential += b"+"
         if self.session is not None and self.alive:
             self.session.set_credential(self.credential)
@@ -173,7 +173,7 @@ class Member:
         self.reconnect()
 
     def reconnect(self) -> None:
-        """End the stream for a better one."""
+        """Replace the stream by a better one."""
         line, self.line = self.line, None
         if line is not None and self.session is not None:
             line.hang_up()
@@ -187,10 +187,10 @@ class Member:
     def _fell_ill(self) -> None:
         self.ill_at = self._timeline.now
 
-    # ── what it is like ──
+    # ── its state ──
 
     def set_interfaces(self, interfaces: dict[InterfaceName, tuple[Address, ...]]) -> None:
-        """Its interfaces come, go or get other addresses."""
+        """Add or remove interfaces, or change their addresses."""
         now = self._timeline.now
         for gone in self.interfaces.keys() - interfaces.keys():
             self.lost_at[gone] = now
@@ -215,7 +215,7 @@ class Member:
             self._say()
 
     def set_services(self, services: ServiceSet) -> None:
-        """It offers or carries others."""
+        """Change the services that it offers or carries."""
         self.services = services
         self._changed()
         if self.alive and self.session is not None:
@@ -223,7 +223,7 @@ class Member:
             self._say()
 
     def paths_changed(self) -> None:
-        """A path went up or down, which is reported at once."""
+        """Report at once that a path went up or down."""
         if self.role is Role.ROBOT and self.session is not None:
             self._paths_due = True
             self.session.report_at_once(self._timeline.now, ReportScope.CHANGES)
@@ -233,7 +233,7 @@ class Member:
 
     @property
     def online(self) -> bool:
-        """Whether it believes that it has a stream which the control plane accepted."""
+        """Whether it believes that it has a stream accepted by the control plane."""
         return self.alive and self.session is not None and self.session.state is ControlState.ONLINE
 
     def _schedule(self) -> None:
@@ -292,7 +292,7 @@ class Member:
         self._schedule()
 
     def line_ended(self, line: Line, *, refused: bool) -> None:
-        """The stream is over, as far as this end can tell."""
+        """Handle the end of the stream as seen from this side."""
         if line is not self.line or self.session is None:
             return
         self.line = None
@@ -302,7 +302,7 @@ class Member:
         self._schedule()
 
     def break_line(self, *, half_open: bool) -> None:
-        """The connection breaks; `half_open`: without a word, and each end finds out in its own time."""
+        """Break the connection; `half_open` means silently, so that each end finds out in its own time."""
         line = self.line
         if line is None:
             return
@@ -315,12 +315,12 @@ class Member:
             line.cut()
 
     def stall(self, seconds: float) -> None:
-        """It reads nothing for a while."""
+        """Read nothing for a while."""
         if self.line is not None:
             self.line.stalled_until = self._timeline.now + seconds
 
     def hear(self, line: Line, message: ControlMessage) -> None:
-        """A message of the control plane."""
+        """Handle a message of the control plane."""
         if line is not self.line or self.session is None:
             return
         before = self.session.state
@@ -329,11 +329,11 @@ class Member:
             if before is not ControlState.ONLINE:
                 self._fell_ill()
                 self.paths_changed()
-            # It may wake sooner than was planned for the longer patience of a registration.
+            # It may wake sooner than planned for the longer patience of a registration.
         elif isinstance(event, Apply):
             self._apply(event)
         elif not isinstance(message, Welcome) and message.version <= self.session.version(_resource_of(message)):
-            # What is newer and yet not taken are changes upon a set that it refused: it says so, and gets all of it.
+            # A newer message that is not taken changes a set that it refused: it says so, and gets the whole set.
             self.complaints.append(f"{self.name}: a version that is not newer: {message.version}")
         self._say()
         self._schedule()
@@ -368,14 +368,14 @@ class Member:
         self.held.mapping_version = Version(max(content.version, self.held.mapping_version))
         return None
 
-    # ── what it measures ──
+    # ── its measurements ──
 
     def is_up(self, interface: InterfaceName, server: NodeName) -> bool:
-        """Whether datagrams arrive."""
+        """Return whether datagrams arrive over this path."""
         return interface not in self.dark and (interface, server) not in self.dark
 
     def _path_changes(self) -> Report:
-        """Paths that are not as they were told last."""
+        """Return the paths whose state differs from the last report."""
         states = self._path_states()
         changed = [(pair, up) for pair, up in states.items() if self._told_up.get(pair) != up]
         self._told_up = states
@@ -421,7 +421,7 @@ class Member:
         return Report(latencies, paths, outcomes)
 
     def registration_as_told(self) -> Registration:
-        """Its registration without what it holds."""
+        """Return its registration without what it holds."""
         return dataclasses.replace(self.registration(), peers_version=Version(0), mapping_version=Version(0))
 
 

@@ -1,4 +1,4 @@
-"""The control plane: its core, its matcher, its log of events, and what its loop does around them. It can be killed."""
+"""Simulates the control plane: its core, matcher and event log, and the work of its loop. It can be killed."""
 
 from __future__ import annotations
 
@@ -38,22 +38,22 @@ if TYPE_CHECKING:
     from protos.model.stream import Heartbeat, SidecarMessage
 
 TURN_S = 0.02
-"""From one turn of the loop to the next at least, while one follows the other."""
+"""Minimum interval between turns of the loop that follow each other."""
 
 SOLVER_LIMIT_S = 1.0
-"""In real time; problems of a day are solved in a part of that."""
+"""Solver's time limit in real time; a day's problems are solved in a part of it."""
 
 FAILS_ONE_IN = 500
-"""Solvings that raise."""
+"""One in this many solvings raises."""
 
 LOAD_EVERY_S = 10.0
 
 WALL_S = 1_800_000_000.0
-"""Seconds since 1970 when simulated time was 0."""
+"""Seconds since 1970 at simulated time 0."""
 
 
 class Plane:
-    """One control plane after the other, at the same address and with the same disk."""
+    """Successive control planes at the same address and with the same disk."""
 
     def __init__(
         self, timeline: Timeline, settings: Settings, folder: Path, rng: random.Random, *, solving_s: float
@@ -72,10 +72,10 @@ class Plane:
         self.policy: Policy | None = None
         self.crl = b""
         self.barred: set[NodeName] = set()
-        """Whose certificates are revoked, or have ended: the gate in front of gRPC lets them not in."""
+        """Members with revoked or expired certificates: the gate in front of gRPC refuses them."""
         self.busy = 0.2
         self.clock_error_s = 0.0
-        """Of its wall clock."""
+        """Error of its wall clock."""
         self.started_at = 0.0
         self.starts = 0
         self.solved = 0
@@ -84,12 +84,12 @@ class Plane:
 
     @property
     def up(self) -> bool:
-        """Whether it runs."""
+        """Whether a control plane runs."""
         return self._core is not None
 
     @property
     def core(self) -> ControlCore:
-        """That of the one that runs."""
+        """The core of the running control plane."""
         assert self._core is not None
         return self._core
 
@@ -99,7 +99,7 @@ class Plane:
     # ── life ──
 
     def start(self) -> None:
-        """Start anew, with nothing but its configuration and its log of events."""
+        """Start with nothing but the configuration and the event log."""
         now = self._timeline.now
         settings = dataclasses.replace(self._settings, policy=self.policy)
         self._core = ControlCore(settings, version_epoch=int(self._wall()) << 20, now=now)
@@ -116,7 +116,7 @@ class Plane:
         self._settle()
 
     def stop(self, *, orderly: bool) -> None:
-        """End: in order, or at once and without a word."""
+        """End, either in an orderly way, or at once and silently."""
         lines = list(self._lines.values())
         assert self.events is not None
         if orderly:
@@ -134,7 +134,7 @@ class Plane:
     # ── streams ──
 
     def register(self, registration: Registration, line: Line) -> StreamId | Refusal:
-        """A stream begins."""
+        """Begin a stream."""
         if registration.name in self.barred:
             return Refusal.BAD_CREDENTIAL
         result = self.core.register(registration, self._timeline.now)
@@ -148,19 +148,19 @@ class Plane:
         return result
 
     def receive(self, stream: StreamId, message: SidecarMessage) -> None:
-        """A message of a stream."""
+        """Handle a message of a stream."""
         self.received += 1
         self.core.receive(stream, message, self._timeline.now)
         self._settle()
 
     def beat(self, stream: StreamId, heartbeat: Heartbeat) -> None:
-        """The same for what changes nothing but the lease; a new Welcome may be due with it."""
+        """Handle a heartbeat, which changes only the lease; a new Welcome may be due with it."""
         self.received += 1
         self.core.receive(stream, heartbeat, self._timeline.now)
         self._dispatch()
 
     def disconnected(self, stream: StreamId) -> None:
-        """A stream ended."""
+        """Handle the end of a stream."""
         self._lines.pop(stream, None)
         if self._core is not None:
             self._core.disconnected(stream, self._timeline.now)
@@ -169,14 +169,14 @@ class Plane:
     # ── what the operator does ──
 
     def set_policy(self, policy: Policy | None) -> None:
-        """Another policy is in force from now on, if it runs; else from its start on."""
+        """Put another policy into force, now if it runs, else from its start on."""
         self.policy = policy
         if self._core is not None:
             self._core.set_policy(policy, self._timeline.now)
             self._settle()
 
     def revoke(self, name: NodeName, reason: RemovalReason, crl: bytes) -> None:
-        """A certificate is not good any more."""
+        """Invalidate a certificate."""
         self.barred.add(name)
         self.crl = crl
         if self._core is not None:
@@ -192,7 +192,7 @@ class Plane:
             self._timeline.after(LOAD_EVERY_S, partial(self._follow_load, core))
 
     def _settle(self) -> None:
-        """Carry out what the core asks for, and be there when it wants its next turn."""
+        """Carry out what the core asks for, and schedule its next turn."""
         self._dispatch()
         due = self._core.next_timer() if self._core is not None else None
         if due is not None:

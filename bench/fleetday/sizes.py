@@ -1,7 +1,7 @@
-"""How large the tables of an object are: everything reachable from its attributes is counted, once.
+"""Measures the tables of an object: everything reachable from its attributes is counted once.
 
-A table is a dictionary, list, set or deque; it is named by the attributes that lead to it, with `[]` for what a table
-holds. So tables of one kind, such as those of every robot, are counted together.
+A table is a dictionary, list, set or deque. It is named by the attributes that lead to it, with `[]` for an element of
+a table. So tables of one kind, such as those of every robot, are counted together.
 """
 
 from __future__ import annotations
@@ -18,21 +18,21 @@ if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
 
 OURS = ("bench.", "controlplane.", "protos.", "sidecar.", "tests.")
-"""Modules whose objects are looked into."""
+"""Modules whose objects are examined."""
 
 
 @dataclass(slots=True)
 class Sizes:
-    """What was counted."""
+    """The counts of one measurement."""
 
     entries: dict[str, int] = field(default_factory=dict)
-    """Of the tables of each name."""
+    """Entries in the tables of each name."""
     bytes: dict[str, int] = field(default_factory=dict)
-    """Of everything below each attribute of the object itself."""
+    """Bytes of everything below each attribute of the object itself."""
 
     @property
     def total_bytes(self) -> int:
-        """Of all."""
+        """Bytes of everything."""
         return sum(self.bytes.values())
 
 
@@ -67,7 +67,7 @@ def measure(root: object) -> Sizes:
 
 
 def _is_shared(one: object) -> bool:
-    """Whether it belongs to the program and to no table."""
+    """Return whether an object belongs to the program and not to a table."""
     return one is None or isinstance(one, (bool, type, enum.Enum, ModuleType)) or callable(one)
 
 
@@ -81,9 +81,9 @@ def _attributes(one: object) -> Iterator[tuple[str, object]]:
 
 
 def grown(samples: list[Sizes], *, share: float, slack: int, capped: Mapping[str, int]) -> list[str]:
-    """Tables that grew from the first half of the samples to the second by more than a share and some slack.
+    """Return the tables that grew from the first half of the samples to the second by more than a share and some slack.
 
-    Those with a cap may grow up to it; of what they hold in turn it is judged how much that is for each entry.
+    Tables with a cap may grow up to it; the tables inside them are judged by their size for each entry.
     """
     found = []
     half = len(samples) // 2

@@ -1,4 +1,4 @@
-"""Simulated time: what happens when."""
+"""Provides simulated time: runs actions at their times."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
 
 class Timeline:
-    """Actions in the order of their times, those of one time in the order they were asked for. Times are seconds."""
+    """Actions in order of their times, and for equal times in order of scheduling. Times are seconds."""
 
     def __init__(self, now: float) -> None:
         self.now = now
@@ -26,15 +26,15 @@ class Timeline:
         return len(self._waiting)
 
     def at(self, when: float, action: Action) -> None:
-        """Do this then, or now if that is over."""
+        """Schedule an action for this time, or for now if that has passed."""
         heapq.heappush(self._waiting, (max(when, self.now), next(self._numbers), action))
 
     def after(self, seconds: float, action: Action) -> None:
-        """Do this so much later."""
+        """Schedule an action this many seconds from now."""
         self.at(self.now + seconds, action)
 
     def run(self, until: float) -> None:
-        """Let time pass."""
+        """Let time pass until `until`."""
         waiting = self._waiting
         while waiting and waiting[0][0] <= until:
             self.now, _, action = heapq.heappop(waiting)
