@@ -1,4 +1,4 @@
-"""The records of runs in one file, so that what was published can be worked out anew, and gone on from."""
+"""Packs the records of runs into one file, so that published figures can be recomputed and extended."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
 
 def pack(outcomes: Iterable[Outcome], folder: str) -> bytes:
-    """A tar.xz with each record at FOLDER/SCENARIO/CONTENDER.json; the same records make the same bytes."""
+    """Return a tar.xz with each record at FOLDER/SCENARIO/CONTENDER.json; the same records give the same bytes."""
     file = io.BytesIO()
     with tarfile.open(fileobj=file, mode="w:xz") as archive:
         for outcome in sorted(outcomes, key=lambda one: (one.scenario, one.contender)):

@@ -1,4 +1,4 @@
-"""What README and docs show of an evaluation: Markdown from `evaluation.json` alone, by the names of their blocks."""
+"""Makes the blocks of an evaluation in README and docs: Markdown from `evaluation.json` alone, by block name."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ _NOTHING: Content = {}
 
 
 def all_blocks(content: Content) -> dict[str, str]:
-    """Name -> Markdown; of an empty content, all say that nothing was measured."""
+    """Return name -> Markdown; for empty content, all blocks say that nothing was measured."""
     return {name: make(content).strip() for name, make in _BLOCKS.items()}
 
 

@@ -1,8 +1,8 @@
-"""Statistics of single networks, as published traces have them: what the generator draws from.
+"""Holds statistics of single networks, from published traces, for the generator to draw from.
 
-Fitted to the drives of "LEO Satellite vs. Cellular Networks" (CoNEXT 2023; uplink), the walks of mp-traces and, for
-round-trip times and loss, the pings of the PAM 2025 multi-carrier data set. `python -m bench scenarios --traces DIR`
-sets them beside the traces.
+They are fitted to the drives of "LEO Satellite vs. Cellular Networks" (CoNEXT 2023; uplink), the walks of mp-traces
+and, for round-trip times and loss, the pings of the PAM 2025 multi-carrier data set. `python -m bench scenarios
+--traces DIR` compares them with the traces.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 Floats = NDArray[np.float64]
 
 PROBABILITIES = (0.01, 0.05, 0.25, 0.5, 0.75, 0.95, 0.99)
-"""Of which a carrier's rates are given; in between, the logarithm of the rate is linear in the probability."""
+"""Probabilities at which a carrier's rates are given; in between, the log of the rate is linear in the probability."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,7 +33,7 @@ class Carrier:
     rtt_ms: float
     """Median of the base round-trip time."""
     fast_s: float = 3.0
-    """Likewise, of the quick part."""
+    """The same for the quick part."""
     up_share: float = 1.0
     """Uplink rate over downlink rate."""
     rtt_sigma: float = 0.0
@@ -41,17 +41,17 @@ class Carrier:
     loss: float = 0.0
     """Probability that a packet is lost."""
     outage_every_s: float = math.inf
-    """Mean seconds from the end of an outage (rate 0) to the next one's begin."""
+    """Mean seconds from the end of an outage (rate 0) to the start of the next."""
     outage_s: float = 1.0
     """Mean length of an outage, seconds; at least a step of the trace."""
 
     def rate_at(self, probability: Floats) -> Floats:
-        """Quantiles of the rate, kbit/s."""
+        """Return quantiles of the rate, kbit/s."""
         rates: Floats = np.exp(np.interp(probability, PROBABILITIES, np.log(self.rates_kbps)))
         return rates
 
     def probability_below(self, rate_kbps: float) -> float:
-        """Share of time, outages aside, with a lower rate."""
+        """Return the share of time, outages aside, with a lower rate."""
         if rate_kbps <= self.rates_kbps[0]:
             return 0.0
         if rate_kbps > self.rates_kbps[-1]:
@@ -59,7 +59,7 @@ class Carrier:
         return float(np.interp(math.log(rate_kbps), np.log(self.rates_kbps), PROBABILITIES))
 
     def autocorrelation(self, lag_s: float) -> float:
-        """Of the rate's normal score."""
+        """Return the autocorrelation of the rate's normal score."""
         return self.slow_share * math.exp(-lag_s / self.slow_s) + (1 - self.slow_share) * math.exp(-lag_s / self.fast_s)
 
     @property
@@ -137,7 +137,7 @@ EVEN_ATT = Carrier(
     rtt_sigma=0.2,
     loss=0.0005,
 )
-"""Where its coverage is good."""
+"""AT&T where its coverage is good."""
 EVEN_VERIZON = Carrier(
     name="Verizon",
     rates_kbps=(6_000, 8_500, 22_000, 30_000, 38_000, 50_000, 60_000),
@@ -148,4 +148,4 @@ EVEN_VERIZON = Carrier(
     rtt_sigma=0.2,
     loss=0.0005,
 )
-"""Likewise."""
+"""Verizon where its coverage is good."""

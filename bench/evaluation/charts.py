@@ -1,4 +1,4 @@
-"""Drawings: along a drive, distributions, bars, misses against the deadline and against bytes.
+"""Draws charts: along a drive, distributions, bars, misses against the deadline and against bytes.
 
 A contender has the same colour in all of them; the direct runs are grey, the ideal is dashed.
 """
@@ -43,7 +43,7 @@ COLOURS = {
     "ideal": "#000000",
 }
 ALONG = ("direct-a", "direct-b", "plr-replicate", "ideal")
-"""In the chart of one window."""
+"""Contenders in the chart of one window."""
 CURVE_POINTS = 300
 BINS = 70
 ROOM = 0.85
@@ -52,16 +52,16 @@ ROOM = 0.85
 
 @dataclass(frozen=True, slots=True)
 class Chart:
-    """One drawing."""
+    """A chart."""
 
     name: str
-    """For a file."""
+    """Name for a file."""
     about: str
     svg: bytes
 
 
 def along(name: str, scenario: str, runs: Mapping[str, Outcome]) -> Chart:
-    """The latency of every request of one window, for those of `ALONG`, which must have run."""
+    """Draw the latency of every request of one window, for the contenders in `ALONG`, which must have run."""
     canvas = Canvas(figsize=(9.5, 4), layout="constrained")
     axes = canvas.add_subplot()
     for contender in ALONG:
@@ -79,7 +79,7 @@ def along(name: str, scenario: str, runs: Mapping[str, Outcome]) -> Chart:
 
 
 def distributions(name: str, pool: Pool) -> Chart:
-    """Histograms of latencies, a row for each contender, with mean and P99."""
+    """Draw histograms of latencies, a row for each contender, with mean and P99."""
     rows = list(pool.runs)
     canvas = Canvas(figsize=(9.5, 0.9 + 0.52 * len(rows)), layout="constrained")
     axes = canvas.add_subplot()
@@ -117,7 +117,7 @@ def distributions(name: str, pool: Pool) -> Chart:
 
 
 def bars(name: str, figures: Mapping[str, Figures]) -> Chart:
-    """Misses, mean, P99 and bytes of each contender."""
+    """Draw misses, mean, P99 and bytes of each contender."""
     panels = {
         "missed, %": [one.miss_ratio * 100 for one in figures.values()],
         "mean, ms": [one.mean_ms for one in figures.values()],
@@ -143,7 +143,7 @@ def bars(name: str, figures: Mapping[str, Figures]) -> Chart:
 
 
 def deadlines(name: str, pool: Pool) -> Chart:
-    """The share of requests that miss, against the deadline."""
+    """Draw the share of requests that miss, against the deadline."""
     canvas = Canvas(figsize=(9.5, 4.4), layout="constrained")
     axes = canvas.add_subplot()
     at_ms = np.geomspace(_least_ms(pool), UNANSWERED_S * MS * 0.999, CURVE_POINTS)
@@ -166,7 +166,7 @@ def deadlines(name: str, pool: Pool) -> Chart:
 
 
 def modes(name: str, costs: Mapping[str, ModeCost]) -> Chart:
-    """What each redundancy mode misses and sends."""
+    """Draw what each redundancy mode misses and sends."""
     canvas = Canvas(figsize=(7.5, 4), layout="constrained")
     axes = canvas.add_subplot()
     for mode, cost in costs.items():

@@ -1,4 +1,4 @@
-"""`python -m bench evaluate`: scenarios x contenders, a record of every request, and a table; misses first."""
+"""`python -m bench evaluate`: runs scenarios x contenders, records every request, and shows a table; misses first."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ USUAL = (*COMPUTED, *(name for name, contender in CONTENDERS.items() if not cont
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Options of `python -m bench evaluate`."""
+    """Add the options of `python -m bench evaluate`."""
     names = (*CONTENDERS, *COMPUTED)
     parser.add_argument("--scenario", action="append", metavar="GLOB", help="these only; `python -m bench scenarios`")
     parser.add_argument(
@@ -70,7 +70,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    """Measure; returns the exit code: 1 when a run failed or was disturbed, 2 when something is not readable."""
+    """Measure and return the exit code: 1 if a run failed or was disturbed, 2 if something is not readable."""
     try:
         scenarios = _chosen(options)
     except (LabConfigError, ConfigError) as error:
@@ -80,7 +80,7 @@ def run(options: argparse.Namespace) -> int:
     names = options.contender or USUAL
     failed: list[str] = []
     void = False
-    # Processes: a lab belongs to the process that made it, which waits for its programs.
+    # Processes, not threads: a lab belongs to the process that made it, which waits for its programs.
     with ProcessPoolExecutor(options.jobs, mp_context=multiprocessing.get_context("spawn")) as pool:
         try:
             runs = {
@@ -101,7 +101,7 @@ def run(options: argparse.Namespace) -> int:
                             outcome = future.result()
                         except LabConfigError:
                             raise
-                        except Exception as error:  # the other runs are worth having
+                        except Exception as error:  # the other runs still count
                             traceback.print_exc()
                             failed.append(f"{scenario.name}, {contender}: {error}".splitlines()[0])
                             continue
@@ -121,7 +121,7 @@ def run(options: argparse.Namespace) -> int:
     costs = mode_costs(figures_by_window(outcomes))
     if costs:
         console.print(rich_table(modes_table(costs)))
-    # Last: drawing takes a processor from what is measured.
+    # Drawing comes last, since it would take a processor from the measurement.
     if outcomes and not options.no_report:
         found = drives.find(read_scenarios(read_folder(options.traces))) if options.traces else None
         report_command.write(options.out, outcomes, failed, drives=found)
@@ -152,7 +152,7 @@ def _is_done(scenario: Scenario, contender: str, out: Path) -> bool:
 
 
 def _run(scenario: Scenario, contender: str, options: argparse.Namespace) -> Outcome:
-    """Run it and keep its record, in a process of the pool."""
+    """Run a scenario with a contender and store its record, in a process of the pool."""
     if contender == ideal.ORACLE:
         outcome = oracle.compute(scenario)
     elif contender in COMPUTED:

@@ -1,4 +1,4 @@
-"""Contenders beside each other in the same windows: over the better direct path, and from what the networks allow."""
+"""Compares contenders in the same windows: with the better direct path, and with what the networks allow."""
 
 from __future__ import annotations
 
@@ -23,12 +23,12 @@ IDEAL = "ideal"
 
 @dataclass(frozen=True, slots=True)
 class Comparison:
-    """One contender in one window. None: what it is compared with was not run, or is void."""
+    """One contender in one window; None where its counterpart was not run, or is void."""
 
     mean_gain: float | None
     """How many times lower its mean is than the lower mean of the two direct runs."""
     p99_gain: float | None
-    """Likewise, of the 99th percentile."""
+    """The same for the 99th percentile."""
     miss_over_ideal: float | None
     """Its miss ratio minus the ideal's."""
     p99_over_ideal: float | None
@@ -39,8 +39,8 @@ class Comparison:
 class Gains:
     """How many times lower one contender's figures are than the better direct run's, over windows.
 
-    The mean of ratios is the geometric one. It moves less than their median from one evaluation to the next: with a
-    dozen windows the median is what the two in the middle happened to do.
+    The mean of ratios is the geometric mean. It varies less than the median from one evaluation to the next: with a
+    dozen windows the median depends on the two in the middle.
     """
 
     windows: int
@@ -51,24 +51,24 @@ class Gains:
 
 
 def better_direct(runs: Mapping[str, Outcome]) -> Outcome:
-    """Of the two direct runs of one window, the one that missed less; of two alike the one with the lower mean."""
+    """Return the direct run of a window that missed less; of two equal ones, that with the lower mean."""
     return min((runs[name] for name in DIRECT), key=lambda run: (run.figures().miss_ratio, run.figures().mean_ms))
 
 
 def compare(outcomes: Iterable[Outcome]) -> dict[str, dict[str, Comparison]]:
-    """Scenario -> contender -> comparison, of runs that are not void."""
+    """Return scenario -> contender -> comparison, for runs that are not void."""
     return {scenario: _window(by_name) for scenario, by_name in figures_by_window(outcomes).items()}
 
 
 def gains(windows: Windows) -> dict[str, Gains]:
-    """Contender -> gains over its hard windows."""
+    """Return contender -> gains over its hard windows."""
     names = dict.fromkeys(name for by_name in windows.values() for name in by_name if name not in (*COMPUTED, *DIRECT))
     found = {name: _gains(name, hard_windows(windows.values(), name)) for name in names}
     return {name: one for name, one in found.items() if one.windows}
 
 
 def hard_windows(windows: Iterable[Mapping[str, Figures]], contender: str) -> list[Mapping[str, Figures]]:
-    """Those in which it and both direct runs ran, and at least one of these missed a deadline."""
+    """Return the windows in which it and both direct runs ran, and at least one of these missed a deadline."""
     return [by_name for by_name in windows if contender in by_name and _is_hard(by_name)]
 
 
@@ -78,13 +78,13 @@ def over_direct(
     figure: str,
     direct: Callable[[Iterable[float]], float] = min,
 ) -> list[float | None]:
-    """In each window, how many times lower a figure is than that of the better direct run; `direct=max`: the worse."""
+    """Return by window how many times lower a figure is than the better direct run's; `direct=max`: the worse one's."""
     value = attrgetter(figure)
     return [ratio(direct(value(one[name]) for name in DIRECT), value(one[contender])) for one in windows]
 
 
 def one_radio_gain(windows: Windows) -> float | None:
-    """How many times lower the median window's mean is with both radios than with one; None: nothing to compare."""
+    """Return how many times lower the median window's mean is with both radios than with one; None without data."""
     both = [by_name for by_name in windows.values() if by_name.keys() >= {ONE_RADIO, SUREST}]
     return median(by_name[ONE_RADIO].mean_ms / by_name[SUREST].mean_ms for by_name in both)
 

@@ -1,7 +1,7 @@
-"""Ways to get answers from a cloud over two carriers: each gives a client, or one for each carrier, ready to call.
+"""Implements ways to get answers from a cloud over two carriers: each gives a client, or one for each carrier.
 
-All of them run in the same lab: a robot with a carrier `a` and a carrier `b`, two servers that take the same time for a
-request, one request at a time. Nobody stands behind a NAT, as DDS does not pass one.
+All of them run in the same lab: a robot with a carrier `a` and a carrier `b`, and two servers that take the same time
+for a request, one request at a time. There is no NAT, since DDS does not pass one.
 """
 
 from __future__ import annotations
@@ -26,51 +26,51 @@ if TYPE_CHECKING:
     from lab import Host, Lab
 
     Clients = Sequence[Remote]
-    """Each sends every request, at the same moments; the first answer counts."""
+    """Clients that each send every request, at the same moments; the first answer counts."""
 
 SERVICE = "/echo"
-"""As of `lab.echo`, which needs ROS."""
+"""The service of `lab.echo`, which needs ROS."""
 PATHS = dict(zip(CARRIERS, ("a", "b"), strict=True))
 """The robot's interface -> the path of the trace behind it."""
 WARM = LinkProfile(delay_ms=20.0, rate_kbps=50_000.0)
-"""Both links while everybody starts and finds the others: the same good network for all."""
+"""Both links while all programs start and find each other: the same good network for all."""
 FALLBACK = "/echo_here"
 FALLBACK_TAKES = 0.15
 """Share of the deadline that the robot's own server takes for a request, with a smaller model: 150 ms of 1 s."""
 BUDGET = 0.1
-"""Of an interface, for the contenders that have one."""
+"""Budget of an interface, for the contenders that have one."""
 ZENOH_PORT = 7447
 ZENOH_LEASE_MS = 10_000
-"""Its default: TCP below survives what is shorter."""
+"""Zenoh's default: the TCP below survives shorter outages."""
 
 
 @dataclass(frozen=True, slots=True)
 class World:
-    """What a contender is started in."""
+    """The environment in which a contender is started."""
 
     lab: Lab
     folder: Path
-    """For configurations and logs."""
+    """Folder for configurations and logs."""
     traffic: Traffic
     notes: dict[str, Any] = field(default_factory=dict)
-    """What a contender tells of its run at the end, for the record."""
+    """What a contender reports of its run at the end, for the record."""
 
     @property
     def robot(self) -> Host:
-        """Where the client runs."""
+        """The host on which the client runs."""
         return self.lab.host(ROBOT)
 
     @property
     def clouds(self) -> tuple[Host, ...]:
-        """Where servers run."""
+        """The hosts on which servers run."""
         return tuple(self.lab.host(name) for name in CLOUDS)
 
     def service(self, cloud: str) -> dict[str, Any]:
-        """How a cloud's server answers, as the programs are told."""
+        """Return how a cloud's server answers, in the form that the programs expect."""
         return {"answer_bytes": self.traffic.answer_bytes, "compute": self.traffic.compute(first=cloud == CLOUDS[0])}
 
     def start_ros_server(self, host: Host, **environment: str) -> None:
-        """Start a ROS server; how long it computes it is told with each request."""
+        """Start a ROS server; each request tells it how long to compute."""
         stall = self.traffic.compute(first=host.name == CLOUDS[0])
         argv = [sys.executable, "-m", "lab.echo", "serve"]
         if stall["stall_every"]:
@@ -78,14 +78,14 @@ class World:
         host.popen(argv, env=environment, log_path=self.folder / f"{host.name}.echo.log")
 
     def start_fallback(self, host: Host) -> None:
-        """Start the robot's own ROS server, which is told how long to compute for the clouds."""
+        """Start the robot's own ROS server; its requests state the computing time of the clouds."""
         delay_ms = max(0.0, FALLBACK_TAKES * self.traffic.deadline_ms - self.traffic.compute_ms)
         argv = [sys.executable, "-m", "lab.echo", "serve", "--service", FALLBACK, "--delay-ms", f"{delay_ms:g}"]
         host.popen(argv, log_path=self.folder / f"{host.name}.echo.log")
 
     @contextlib.contextmanager
     def ros_client(self, **environment: str) -> Iterator[Remote]:
-        """A ROS client that has found a server."""
+        """Yield a ROS client that has found a server."""
         with self.remote("ros", self.robot, **environment) as client:
             client.ask("connect", answer_bytes=self.traffic.answer_bytes, compute_s=self.traffic.compute_ms / 1e3)
             yield client
@@ -97,7 +97,7 @@ class World:
 
 @dataclass(frozen=True, slots=True)
 class Contender:
-    """One way."""
+    """One way to get answers."""
 
     name: str
     about: str
@@ -105,10 +105,10 @@ class Contender:
     carriers: tuple[str, ...] = CARRIERS
     """Interfaces that the robot has."""
     ablation: bool = False
-    """A variant of another one: run only when asked for by name."""
+    """Whether it is a variant of another contender, run only when requested by name."""
 
     def lab(self) -> LabConfig:
-        """The lab that it needs."""
+        """Return the lab that it needs."""
         interfaces = tuple(InterfaceSpec(name, nat=None, up=WARM, down=WARM) for name in self.carriers)
         return LabConfig(
             robots=(HostSpec(ROBOT, interfaces),), clouds=tuple(server(name) for name in CLOUDS), source_routing=True
@@ -117,7 +117,7 @@ class Contender:
 
 def _direct(world: World, *, carrier: str) -> Iterator[Clients]:
     cloud = world.clouds[0]
-    # Multicast does not cross routers: each is told where the other is.
+    # Multicast does not cross routers: each side is told the other's address.
     there = {"ROS_AUTOMATIC_DISCOVERY_RANGE": "SUBNET", "ROS_STATIC_PEERS": cloud.address()}
     here = {**there, "ROS_STATIC_PEERS": world.robot.address(carrier)}
     world.start_ros_server(cloud, **here)
@@ -143,7 +143,7 @@ def _zenoh(world: World, *, drop: bool = False) -> Iterator[Clients]:
         for cloud in world.clouds:
             listener = stack.enter_context(world.remote("zenoh", cloud))
             listener.ask("listen", ports=[ZENOH_PORT], **common, **world.service(cloud.name))
-        # A process for each session: one that blocks, its link being full, holds up no other.
+        # One process per session: a session blocked by a full link must not hold up another.
         clients = []
         for cloud, carrier in zip(world.clouds, CARRIERS, strict=True):
             client = stack.enter_context(world.remote("zenoh", world.robot))
@@ -197,7 +197,7 @@ def _plr(
 
 
 def _explained(system: System) -> list[str]:
-    """What `plr explain` says of the interfaces that carried copies of the same requests."""
+    """Return what `plr explain` says about the interfaces that carried copies of the same requests."""
     return [
         f"{joint.first} and {joint.second}{f', both to {joint.server}' if joint.server else ''}: "
         f"both missed {joint.both_missed:.0f} of {joint.requests:.0f} "
@@ -261,4 +261,4 @@ _ALL = (
     *(_plr_of(interfaces, servers) for interfaces, servers in ((1, 1), (1, 2), (2, 1))),
 )
 CONTENDERS = {contender.name: contender for contender in _ALL}
-"""By name; the ideals (`bench.evaluation.ideal`) stand beside them."""
+"""Contenders by name; the ideals (`bench.evaluation.ideal`) come in addition."""

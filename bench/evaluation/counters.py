@@ -1,4 +1,4 @@
-"""What the robot's own metrics say of a run of ours, from `conditions.counters`."""
+"""Reads what the robot's own metrics say about a run of ours, from `conditions.counters`."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ _LABEL = re.compile(r'(\w+)="([^"]*)"')
 
 
 def total(run: Outcome, name: str, /, **labels: str) -> float | None:
-    """The sum of a counter's series with these labels; None: not recorded."""
+    """Return the sum of a counter's series with these labels; None if not recorded."""
     values = [
         value
         for series, value in run.conditions.get("counters", {}).items()
@@ -22,16 +22,16 @@ def total(run: Outcome, name: str, /, **labels: str) -> float | None:
 
 
 def interfaces(outcome: Outcome) -> list[str]:
-    """Those over which copies went."""
+    """Return the interfaces over which copies went."""
     series = (one for one in outcome.conditions.get("counters", {}) if one.startswith("plr_copy_bytes_total{"))
     return sorted({dict(_LABEL.findall(one))["interface"] for one in series})
 
 
 def extra_share(outcome: Outcome) -> dict[str, float]:
-    """Interface -> bytes of extra copies over those of the requests that were answered in time; empty: not recorded.
+    """Return interface -> bytes of extra copies over those of requests answered in time; empty if not recorded.
 
-    Of the whole life of the sidecar, so that nothing was saved up before. The bytes answered are those of all first
-    copies times the share of requests answered in time: all requests of a run are of one size.
+    The figures cover the whole life of the sidecar, so that nothing was saved up before. The bytes answered are those
+    of all first copies times the share of requests answered in time: all requests of a run have one size.
     """
     asked = total(outcome, "plr_requests_total")
     in_time = total(outcome, "plr_requests_total", outcome="ok")
@@ -46,7 +46,7 @@ def extra_share(outcome: Outcome) -> dict[str, float]:
 
 
 def missed_by_network(outcome: Outcome) -> int | None:
-    """Requests that the network did not answer in time, those of the warm-up included; None: not recorded."""
+    """Return how many requests the network did not answer in time, including the warm-up; None if not recorded."""
     asked = total(outcome, "plr_requests_total")
     in_time = total(outcome, "plr_requests_total", outcome="ok")
     return None if asked is None or in_time is None else round(asked - in_time)

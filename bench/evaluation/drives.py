@@ -1,4 +1,4 @@
-"""Which recorded windows are one drive: two that replay the same seconds of one recording say one thing, not two.
+"""Finds which recorded windows are one drive: two that replay the same seconds of a recording are not independent.
 
 Each network of a drive was recorded once, and each pair of networks in the car makes a trace. So traces of different
 pairs share networks, and windows around the middles of their traces overlap.
@@ -18,13 +18,13 @@ if TYPE_CHECKING:
     from lab.trace_folder import TraceEntry
 
     Rates = Mapping[str, Sequence[float]]
-    """Network -> downlink rate in each step, as recorded; uplink rates are made of them."""
+    """Network -> downlink rate in each step, as recorded; uplink rates are derived from them."""
 
 SAME = 0.5
-"""Two windows are one drive when so much of them, or more, is the same seconds."""
+"""Two windows are one drive if at least this share of them is the same seconds."""
 _ALIKE = 1e-3
 _VARIED = 3
-"""Rates that take fewer values than this, such as an outage's zeros, say nothing of where they come from."""
+"""Rates with fewer distinct values than this, such as an outage's zeros, do not show where they come from."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,13 +32,13 @@ class Drives:
     """Recorded windows of case A."""
 
     distinct: tuple[tuple[str, ...], ...]
-    """Scenarios that replay the same drive stand together."""
+    """Scenarios grouped by the drive that they replay."""
     recordings: int
-    """Recordings that they come from; some gave two drives, at different times."""
+    """Number of recordings that they come from; some gave two drives, at different times."""
 
 
 def find(scenarios: Iterable[Scenario]) -> Drives:
-    """Compare the traces of recorded scenarios. Raises LabConfigError: one is not readable."""
+    """Compare the traces of recorded scenarios; raises LabConfigError if one is not readable."""
     windows = {one.name: one.window for one in scenarios if one.case == "A" and one.window is not None}
     of_window = {name: _rates(window.entry, window.load()) for name, window in windows.items()}
     of_trace = {window.entry.name: _rates(window.entry, window.entry.load()) for window in windows.values()}
@@ -51,7 +51,7 @@ def find(scenarios: Iterable[Scenario]) -> Drives:
 
 
 def shared_steps(one: Sequence[float], other: Sequence[float], least: int) -> int:
-    """How many steps of both are the same, where the one is laid upon the other at its best; below `least`: 0."""
+    """Return how many steps agree at the best alignment of the two; 0 if fewer than `least`."""
     found = 0
     for lag in range(least - len(other), len(one) - least + 1):
         begin, end = max(0, lag), min(len(one), lag + len(other))
@@ -61,7 +61,7 @@ def shared_steps(one: Sequence[float], other: Sequence[float], least: int) -> in
 
 
 def together(names: Sequence[str], alike: Callable[[str, str], bool]) -> tuple[tuple[str, ...], ...]:
-    """Names in groups: each is alike with another one of its group."""
+    """Group names so that each is alike with another one of its group."""
     groups: list[list[str]] = []
     for name in names:
         near = [group for group in groups if any(alike(name, other) for other in group)]

@@ -1,4 +1,4 @@
-"""The figures of `targets`, from the records of runs, each with what it comes from. Void runs count nowhere."""
+"""Computes the figures of `targets` from the records of runs, each with its basis. Void runs count nowhere."""
 
 from __future__ import annotations
 
@@ -23,27 +23,27 @@ if TYPE_CHECKING:
 
 PATH_IDEALS = ("ideal-a", "ideal-b")
 BELOW_LOAD = 0.1
-"""A path alone that misses a larger share than this is below the offered load for that long."""
+"""If a path alone misses a larger share than this, its rate is below the offered load for that share of the time."""
 WITH_BUDGET = ("plr-adaptive-10%", "plr-hedge-10%")
 
 
 @dataclass(slots=True)
 class Evidence:
-    """What was found."""
+    """The figures found."""
 
     figures: dict[str, Figure] = field(default_factory=dict)
-    """Without those that could not be had."""
+    """Figures by name, without those that are not available."""
     notes: dict[str, str] = field(default_factory=dict)
-    """By the same names: what a figure comes from."""
+    """The basis of each figure, by the same names."""
 
     def add(self, name: str, figure: Figure, note: str) -> None:
-        """Take a figure and where it comes from."""
+        """Add a figure and its basis."""
         self.figures[name] = figure
         self.notes[name] = note
 
 
 def gather(outcomes: Sequence[Outcome], again: Measured | None = None) -> Evidence:
-    """All figures; `again`: another evaluation of the same windows."""
+    """Compute all figures; `again` is another evaluation of the same windows."""
     found = Evidence()
     recorded = [one for one in outcomes if one.case == "A" and is_recorded(one.scenario)]
     _drives(found, recorded)

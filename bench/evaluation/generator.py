@@ -1,4 +1,4 @@
-"""Seeded random traces of two paths. The same kind, seed and length give the same trace.
+"""Generates seeded random traces of two paths. The same kind, seed and length give the same trace.
 
 Each rate is a quantile function of a Gaussian score, the sum of a slow and a quick first-order autoregressive process
 (a Gaussian copula over time); the innovations of the two paths are correlated. Outages of each path and dead zones of
@@ -22,16 +22,16 @@ if TYPE_CHECKING:
     from bench.evaluation.kinds import Kind
 
 RTT_MEMORY_S = 2.0
-"""In which the autocorrelation of the base round-trip time falls to 1/e."""
+"""Seconds in which the autocorrelation of the base round-trip time falls to 1/e."""
 
 
 def generate(kind: str, seed: int, duration_s: float) -> Trace:
-    """A trace of a kind of `KINDS` (KeyError: no such kind), `duration_s` long."""
+    """Generate a trace of a kind in `KINDS` (else KeyError) that lasts `duration_s`."""
     return generate_kind(KINDS[kind], f"{kind}-{seed}", duration_s)
 
 
 def generate_kind(kind: Kind, name: str, duration_s: float) -> Trace:
-    """A trace named `name`, which is also the seed."""
+    """Generate a trace named `name`, which is also the seed."""
     rng = np.random.default_rng(zlib.crc32(name.encode()))
     steps = max(1, round(duration_s / kind.step_s))
     carriers = (kind.a, kind.b)
@@ -58,7 +58,7 @@ def _innovations(rng: np.random.Generator, steps: int, correlation: float) -> Fl
 
 
 def _autoregressive(innovations: Floats, steps_over_memory: float) -> Floats:
-    """A stationary process of variance 1."""
+    """Return a stationary process of variance 1."""
     memory = math.exp(-steps_over_memory)
     fresh = math.sqrt(1 - memory**2)
     values = np.empty_like(innovations)
@@ -69,7 +69,7 @@ def _autoregressive(innovations: Floats, steps_over_memory: float) -> Floats:
 
 
 def _chain(rng: np.random.Generator, steps: int, step_s: float, every_s: float, length_s: float) -> np.ndarray:
-    """Where a stationary two-state chain is in its rare state."""
+    """Return where a stationary two-state chain is in its rare state."""
     if math.isinf(every_s):
         return np.zeros(steps, bool)
     enter, leave = min(1.0, step_s / every_s), min(1.0, step_s / length_s)

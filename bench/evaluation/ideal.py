@@ -1,8 +1,8 @@
-"""What two first-in-first-out paths would have given, computed from the trace: nothing is run.
+"""Computes from the trace what two first-in-first-out paths would have achieved; nothing is run.
 
 Each path is first in, first out in both directions (`controlplane.planning.fifo`) and carries every request; the ideal
-takes, for each request, the faster of the two. Nobody calls losers off or shares a request out here, so it is no bound:
-a system that does can be better where a queue builds up. `bench.evaluation.oracle` is nearer to a bound.
+takes, for each request, the faster of the two. It neither cancels losing copies nor splits a request, so it is no
+bound: a system that does can be better where a queue builds up. `bench.evaluation.oracle` is closer to a bound.
 """
 
 from __future__ import annotations
@@ -20,14 +20,14 @@ if TYPE_CHECKING:
     from bench.evaluation.scenario import Scenario
 
 IDEALS = {"ideal": ("a", "b"), "ideal-a": ("a",), "ideal-b": ("b",)}
-"""Both paths, and each alone."""
+"""Paths of each ideal: both, and each alone."""
 ORACLE = "oracle"
 COMPUTED = (*IDEALS, ORACLE)
-"""Contenders that are not run; `bench.evaluation.oracle` has the last."""
+"""Contenders that are computed, not run; `bench.evaluation.oracle` computes the last."""
 
 
 def compute(scenario: Scenario, contender: str) -> Outcome:
-    """The outcome of one of `IDEALS`; always the same."""
+    """Return the outcome of one of `IDEALS`; it is always the same."""
     traffic = scenario.traffic
     trace = scenario.trace()
     names = IDEALS[contender]
@@ -35,7 +35,7 @@ def compute(scenario: Scenario, contender: str) -> Outcome:
         (
             FifoPath(trace.path(name)),
             Compute(**traffic.compute(first=name == names[0])),
-            # What a path loses is the same with the other path and without.
+            # A path loses the same packets with and without the other path.
             random.Random(zlib.crc32(f"{scenario.name} {name}".encode())),
         )
         for name in names

@@ -1,4 +1,4 @@
-"""Kinds of scenario that the generator knows: two carriers, what they have in common, what is sure to happen."""
+"""Defines the generator's kinds of scenario: two carriers, what they have in common, and what is sure to happen."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ from bench.evaluation.carriers import (
 )
 
 DEAD_ZONE_FACTOR = 0.05
-"""What a dead zone leaves of a rate."""
+"""Share of a rate that remains in a dead zone."""
 
 
 @dataclass(frozen=True, slots=True)
 class Blackout:
-    """A stretch without any rate that every window of the kind has."""
+    """A period of rate 0 that every window of the kind has."""
 
     paths: str
     """`a`, `b` or `ab`."""
@@ -33,12 +33,12 @@ class Blackout:
 
 @dataclass(frozen=True, slots=True)
 class Kind:
-    """Two paths."""
+    """A kind of scenario with two paths."""
 
     a: Carrier
     b: Carrier
     common: float = 0.0
-    """Correlation of what drives the two rates, 0 to 1."""
+    """Correlation of the processes that drive the two rates, 0 to 1."""
     dead_every_s: float = math.inf
     """Mean seconds between common dead zones, in which both rates fall to DEAD_ZONE_FACTOR."""
     dead_s: float = 10.0
@@ -78,8 +78,8 @@ KINDS = {
         common=0.95,
         dead_every_s=60.0,
         dead_s=8.0,
-        # Both radios lose their cell, and once one of them alone: what there is to gain is little, but not nothing.
+        # Both radios lose their cell, and once one of them alone: the possible gain is small, but not zero.
         blackouts=(Blackout("ab", 0.3, 0.35), Blackout("b", 0.5, 0.55), Blackout("ab", 0.7, 0.75)),
     ),
 }
-"""By the name that scenario files use."""
+"""Kinds by the name that scenario files use."""

@@ -1,4 +1,4 @@
-"""What an evaluation measured, window by window: from the records of its runs, or from the figures it published."""
+"""Reads what an evaluation measured, window by window, from the records of its runs or its published figures."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _FIGURES = tuple(one.name for one in fields(Figures))
 
 @dataclass(frozen=True, slots=True)
 class Measured:
-    """Void runs left out."""
+    """The figures of an evaluation, without void runs."""
 
     windows: dict[str, dict[str, Figures]]
     """Scenario -> contender -> figures."""
@@ -27,13 +27,13 @@ class Measured:
 
     @classmethod
     def of(cls, outcomes: Iterable[Outcome]) -> Self:
-        """From the records of runs."""
+        """Make it from the records of runs."""
         kept = list(outcomes)
         return cls(figures_by_window(kept), {one.scenario: one.case for one in kept})
 
     @classmethod
     def published(cls, file: Path) -> Self:
-        """From the `evaluation.json` of a report. Raises ValueError: not such a file; names it."""
+        """Read the `evaluation.json` of a report; raises ValueError, which names the file, if it is not one."""
         try:
             runs: Mapping[str, Mapping[str, Mapping[str, Any]]] = json.loads(file.read_text(encoding="utf-8"))["runs"]
             windows = {

@@ -1,10 +1,10 @@
-"""What an oracle gets over both paths: it knows the whole trace, and each request shares the two.
+"""Computes what an oracle achieves over both paths: it knows the whole trace, and splits each request over the two.
 
-The ideal (`bench.evaluation.ideal`) is no bound, as it sends whole requests down both paths and gives none up. This one
-sends the bytes of each request over both at once, as many as each path bears, so that both parts end together. What
-cannot be in time is not sent at all. Requests go in the order in which they are due: giving up one that could be in
-time may save two, so even this is no strict bound. Nothing is lost, and servers are never busy. No program can do it,
-because none knows what a path will bear.
+The ideal (`bench.evaluation.ideal`) is no bound, since it sends whole requests down both paths and gives none up. The
+oracle sends the bytes of each request over both at once, as many as each path carries, so that both parts end together.
+A request that cannot be in time is not sent at all. Requests go in the order in which they are due: giving up one that
+could be in time may save two, so even this is no strict bound. Nothing is lost, and servers are never busy. No program
+can do this, because none knows what a path will carry.
 """
 
 from __future__ import annotations
@@ -36,16 +36,16 @@ class _Path:
         self._compute_s = traffic.compute_ms / 1e3
         self._answer_bytes = traffic.answer_bytes
         self.free_s = 0.0
-        """When what was sent so far has left."""
+        """When everything sent so far has left."""
 
     def answered(self, left_s: float) -> float:
-        """When the answer is here, if the request has left at `left_s`."""
+        """Return when the answer arrives, if the request has left at `left_s`."""
         starts = left_s + self._up.delay_at(left_s) + self._compute_s
         back = self._down.time_of(self._down.capacity_by(starts) + self._answer_bytes)
         return back if math.isinf(back) else back + self._down.delay_at(back)
 
     def last_use(self, begin_s: float, deadline_s: float) -> float:
-        """Until when bytes may leave so that the answer is in time; `begin_s` if they never may."""
+        """Return until when bytes may leave so that the answer is in time; `begin_s` if they never may."""
         if self.answered(begin_s) > deadline_s:
             return begin_s
         early, late = begin_s, deadline_s
@@ -55,12 +55,12 @@ class _Path:
         return early
 
     def room(self, begin_s: float, end_s: float) -> float:
-        """Bytes that can leave between the two."""
+        """Return the bytes that can leave between the two times."""
         return self._up.capacity_by(end_s) - self._up.capacity_by(begin_s)
 
 
 def compute(scenario: Scenario) -> Outcome:
-    """The oracle's outcome; always the same. What it gives up has no answer."""
+    """Return the oracle's outcome, which is always the same. A request that it gives up has no answer."""
     traffic = scenario.traffic
     trace = scenario.trace()
     paths = [_Path(trace.path(name), traffic) for name in ("a", "b")]
@@ -73,7 +73,7 @@ def compute(scenario: Scenario) -> Outcome:
 
 
 def _send(paths: Sequence[_Path], due_s: float, deadline_s: float, size: float) -> float | None:
-    """Send one request over both paths; when it is answered, or None, and nothing is sent: it cannot be in time."""
+    """Send a request over both paths and return when it is answered; if it cannot be in time, send nothing: None."""
     spans = [(path, begin := max(path.free_s, due_s), path.last_use(begin, deadline_s)) for path in paths]
     used = [(path, begin, end) for path, begin, end in spans if end > begin]
 

@@ -1,4 +1,4 @@
-"""What a user could take instead, beside `plr-replicate` in the same windows: the recorded drives of case A."""
+"""Compares alternatives with `plr-replicate` in the same windows: the recorded drives of case A."""
 
 from __future__ import annotations
 
@@ -16,16 +16,16 @@ if TYPE_CHECKING:
     from bench.evaluation.outcome import Outcome
 
 BETTER_DIRECT = "better direct"
-"""In each window the direct run that missed less: a choice that nobody can make beforehand."""
+"""The direct run that missed less in each window: a choice that nobody can make in advance."""
 OTHERS = ("mptcp", "zenoh", "zenoh-drop")
 COMPARED = ("miss_ratio", "unanswered_ratio", "mean_ms", "p50_ms", "p99_ms", "bytes_per_request")
-"""Figures of which it is counted who has the lower one."""
+"""Figures for which it is counted which contender is lower."""
 PLR = ("plr-single", "plr-hedge", "plr-adaptive", SUREST)
 
 
 @dataclass(frozen=True, slots=True)
 class Pooled:
-    """All requests of several windows as one run, and the middle one of the windows' tails."""
+    """All requests of several windows as one run, and the median of the windows' tails."""
 
     figures: Figures
     median_p99_ms: float
@@ -33,13 +33,13 @@ class Pooled:
 
 @dataclass(frozen=True, slots=True)
 class Beside:
-    """One of them and ours, over the windows in which both ran, and both direct runs."""
+    """An alternative and ours, over the windows in which both and both direct runs ran."""
 
     windows: int
     theirs: Pooled
     ours: Pooled
     lower: dict[str, tuple[int, int]]
-    """Figure -> windows in which theirs is the lower one, and ours; in the others both are alike."""
+    """Figure -> number of windows in which theirs is lower, and in which ours is; in the others they are equal."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,12 +51,12 @@ class Everywhere:
 
 
 def pooled(runs: Sequence[Outcome]) -> Pooled:
-    """Of at least one run."""
+    """Pool at least one run."""
     return Pooled(together(runs).figures(), median(run.figures().p99_ms for run in runs) or 0.0)
 
 
 def beside(outcomes: Iterable[Outcome]) -> dict[str, Beside]:
-    """Contender -> comparison; those that never ran beside ours are left out."""
+    """Return contender -> comparison; those that never ran beside ours are left out."""
     drives = [one for one in outcomes if one.case == "A" and is_recorded(one.scenario)]
     windows = [runs for runs in by_window(drives).values() if runs.keys() >= {*DIRECT, SUREST}]
     pairs = {BETTER_DIRECT: [(better_direct(runs), runs[SUREST]) for runs in windows]}
@@ -66,9 +66,9 @@ def beside(outcomes: Iterable[Outcome]) -> dict[str, Beside]:
 
 
 def everywhere(outcomes: Iterable[Outcome], names: Sequence[str]) -> Everywhere | None:
-    """Whoever of `names` ran in every recorded drive in which both direct runs and those of `names` that are `PLR` ran.
+    """Return the `names` that ran in every recorded drive in which the direct runs and the `PLR` ones of `names` ran.
 
-    None: there is no such drive.
+    Returns None if there is no such drive.
     """
     drives = by_window(one for one in outcomes if one.case == "A" and is_recorded(one.scenario))
     needed = {*DIRECT, *(name for name in names if name in PLR)}
@@ -85,7 +85,7 @@ def everywhere(outcomes: Iterable[Outcome], names: Sequence[str]) -> Everywhere 
 def _beside(both: Sequence[tuple[Outcome, Outcome]]) -> Beside:
     lower = {}
     for figure in COMPARED:
-        # Times are known to the microsecond: what differs by less is alike.
+        # Times are known to the microsecond: smaller differences are ties.
         values = [tuple(round(getattr(run.figures(), figure) or 0.0, 6) for run in pair) for pair in both]
         lower[figure] = (sum(one < other for one, other in values), sum(one > other for one, other in values))
     return Beside(len(both), pooled([one for one, _ in both]), pooled([other for _, other in both]), lower)

@@ -1,8 +1,8 @@
-"""What became of every request of a run, and the figures that follow: misses first, then latencies.
+"""Holds what became of every request of a run, and derives its figures: misses first, then latencies.
 
-A request is due when the workload says so; from then on its latency counts, also when its sender was blocked. Whoever
-has no answer after UNANSWERED_S counts as UNANSWERED_S in means and quantiles: else the worse system looks better,
-because only its easy requests are left.
+A request is due when the workload says so; its latency counts from then on, even if its sender was blocked. A request
+without an answer after UNANSWERED_S counts as UNANSWERED_S in means and quantiles. Otherwise the worse system would
+look better, because only its easy requests would be left.
 """
 
 from __future__ import annotations
@@ -25,38 +25,38 @@ UNANSWERED_S = 10.0
 
 @dataclass(frozen=True, slots=True)
 class Request:
-    """One request; seconds from the window's begin."""
+    """One request; times are seconds from the start of the window."""
 
     due_s: float
     sent_s: float | None
-    """None: never, its sender was blocked."""
+    """None if never, because its sender was blocked."""
     answered_s: float | None
-    """None: never."""
+    """None if never."""
 
     @property
     def latency_s(self) -> float:
-        """From when it was due, UNANSWERED_S at most."""
+        """Latency since it was due, at most UNANSWERED_S."""
         return UNANSWERED_S if self.answered_s is None else min(UNANSWERED_S, self.answered_s - self.due_s)
 
 
 @dataclass(frozen=True, slots=True)
 class Figures:
-    """Of one run, or of several together."""
+    """Figures of one run, or of several together."""
 
     requests: int
     miss_ratio: float
-    """Share that had no answer by the deadline."""
+    """Share of requests without an answer by the deadline."""
     unanswered_ratio: float
-    """Share that had none after UNANSWERED_S."""
+    """Share of requests without an answer after UNANSWERED_S."""
     mean_ms: float
     p50_ms: float
     p99_ms: float
     bytes_per_request: float | None
-    """Bytes of IP packets that the robot sent, over all its interfaces; None: computed, not run."""
+    """Bytes of IP packets that the robot sent, over all its interfaces; None if computed, not run."""
 
     @property
     def misses(self) -> float:
-        """How many requests."""
+        """Number of requests that missed the deadline."""
         return self.miss_ratio * self.requests
 
 
@@ -70,14 +70,14 @@ class Outcome:
     deadline_ms: float
     requests: tuple[Request, ...]
     bytes_sent: dict[str, int] = field(default_factory=dict)
-    """Of IP packets that the robot sent in the window, by interface."""
+    """Bytes of IP packets that the robot sent in the window, by interface."""
     disturbances: tuple[str, ...] = ()
-    """Why the run is void; nothing: it counts."""
+    """Why the run is void; empty if it counts."""
     conditions: dict[str, Any] = field(default_factory=dict)
     """How late emulator and client were, how busy the machine was."""
 
     def figures(self) -> Figures:
-        """The figures; the run must have requests."""
+        """Return the figures; the run must have requests."""
         latencies = [request.latency_s for request in self.requests]
         count = len(latencies)
         late = sum(latency * MS > self.deadline_ms for latency in latencies)
@@ -92,14 +92,14 @@ class Outcome:
         )
 
     def write(self, folder: Path) -> Path:
-        """Write it to FOLDER/SCENARIO/CONTENDER.json; returns the file."""
+        """Write it to FOLDER/SCENARIO/CONTENDER.json and return the file."""
         file = folder / self.scenario / f"{self.contender}.json"
         file.parent.mkdir(parents=True, exist_ok=True)
         file.write_text(self.text(), encoding="utf-8")
         return file
 
     def text(self) -> str:
-        """What `write` writes; times to the microsecond."""
+        """Return what `write` writes, with times to the microsecond."""
         requests = [
             {name: None if at is None else round(at, 6) for name, at in asdict(one).items()} for one in self.requests
         ]
@@ -107,7 +107,7 @@ class Outcome:
 
     @classmethod
     def read(cls, file: Path) -> Self:
-        """The inverse of `write`. Raises ValueError: not such a file; names it."""
+        """Read what `write` wrote; raises ValueError, which names the file, if it is not such a file."""
         try:
             fields: dict[str, Any] = json.loads(file.read_text(encoding="utf-8"))
             del fields["figures"]
@@ -119,7 +119,7 @@ class Outcome:
 
 
 def together(runs: Sequence[Outcome]) -> Outcome:
-    """All requests of runs with one deadline, as one run."""
+    """Combine all requests of runs with one deadline into one run."""
     sent = sum(sum(run.bytes_sent.values()) for run in runs)
     requests = tuple(request for run in runs for request in run.requests)
     one = runs[0]
@@ -127,7 +127,7 @@ def together(runs: Sequence[Outcome]) -> Outcome:
 
 
 def by_window(outcomes: Iterable[Outcome]) -> dict[str, dict[str, Outcome]]:
-    """Scenario -> contender -> run, without the void ones."""
+    """Return scenario -> contender -> run, without void runs."""
     found: dict[str, dict[str, Outcome]] = {}
     for outcome in outcomes:
         if not outcome.disturbances:

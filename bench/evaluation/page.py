@@ -1,4 +1,4 @@
-"""The evaluation as one HTML file: verdicts, the paper's ratios, then each case study's charts and tables."""
+"""Renders the evaluation as one HTML file: verdicts, the paper's ratios, then each case study's charts and tables."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
 
 def render(report: Report) -> str:
-    """The whole page."""
+    """Return the whole page."""
     evidence = report.evidence
     verdicts = verdicts_as_html(TARGETS, evidence.figures, evidence.notes)
     ratios = f"<h2>Beside the paper</h2>{table_as_html(report.ratios)}" if report.ratios.rows else ""

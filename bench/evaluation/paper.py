@@ -1,4 +1,4 @@
-"""The paper's ratios (sections V.A and V.B, with its errata) and ours beside them."""
+"""Compares the paper's ratios (sections V.A and V.B, with its errata) with ours."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class PaperRatio:
-    """How many times lower the paper's system is than a single path; None: not printed."""
+    """How many times lower the paper's system is than a single path; None if not printed."""
 
     case: str
     about: str
@@ -41,23 +41,23 @@ PRINTED = (
 
 @dataclass(frozen=True, slots=True)
 class OurRatio:
-    """`plr-replicate` in the windows of one study; None: nothing to compare."""
+    """The ratio of `plr-replicate` in the windows of one study; None if there is nothing to compare."""
 
     paper: PaperRatio
     recorded: bool
     windows: int
     hard_windows: int
-    """Those in which a direct run misses anything."""
+    """Number of windows in which a direct run misses anything."""
     over_worse: float | None
     """Geometric mean over the hard windows."""
     over_better: float | None
     pooled_over_worse: float | None
-    """All requests of all windows as one run; of the direct runs, in each window, the worse."""
+    """Ratio with all requests of all windows as one run, against the worse direct run of each window."""
     pooled_over_better: float | None
 
 
 def ratios(studies: Sequence[Study]) -> list[OurRatio]:
-    """For each printed one, from the recorded windows of its case; from made-up ones where none was recorded."""
+    """Return a ratio for each printed one, from the recorded windows of its case, else from generated ones."""
     found = []
     for paper in PRINTED:
         of_case = [study for study in studies if study.case == paper.case]
@@ -69,7 +69,7 @@ def ratios(studies: Sequence[Study]) -> list[OurRatio]:
 
 
 def _ratio(paper: PaperRatio, recorded: bool, windows: Sequence[Mapping[str, Outcome]]) -> OurRatio:
-    # Beginning with the better direct run of each window, by this figure.
+    # The better direct run of each window, by this figure, comes first.
     directs = [sorted((runs[name] for name in DIRECT), key=lambda run: _value(run, paper)) for runs in windows]
     ours = [runs[SUREST] for runs in windows]
     figures = [{name: run.figures() for name, run in runs.items()} for runs in windows]
@@ -96,7 +96,7 @@ def _value(run: Outcome, paper: PaperRatio) -> float:
 
 
 def table(found: Sequence[OurRatio]) -> Table:
-    """For people."""
+    """Return the ratios as a table."""
     columns = (
         "",
         "paper: over the worse path",

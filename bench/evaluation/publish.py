@@ -1,7 +1,7 @@
-"""Keeping an evaluation in the repository: its data, its summary, and the figures within README and docs.
+"""Stores an evaluation in the repository: its data, its summary, and the figures within README and docs.
 
-A figure stands in a page between `<!-- evaluation: NAME -->` and `<!-- end -->`; `blocks` makes what is between them
-from `docs/develop/results/evaluation.json`. A test makes it again and compares: nobody edits such a figure by hand.
+A figure stands in a page between `<!-- evaluation: NAME -->` and `<!-- end -->`; `blocks` makes the text between them
+from `docs/develop/results/evaluation.json`. A test makes it again and compares: no figure is edited by hand.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ RESULTS = Path("docs/develop/results")
 DATA, SUMMARY, RECORDS = "evaluation.json", "evaluation.md", "records.tar.xz"
 PAGES = ("README.md", "docs/*/*.md")
 FILES = "files"
-"""Key of the data under which each other published file has its hash, so that an edited one is noticed."""
+"""Key of the data that holds the hash of each other published file, so that an edited one is noticed."""
 _BLOCK = re.compile(r"(<!-- evaluation: ([\w-]+) -->\n)(.*?)(<!-- end -->)", re.DOTALL)
 _MARK = re.compile(r"<!-- (?:evaluation: |end -->)")
 _NUMBER = re.compile(r"\d+(?:[.,]\d+)*")
@@ -30,20 +30,20 @@ _NUMBER = re.compile(r"\d+(?:[.,]\d+)*")
 
 @dataclass(frozen=True, slots=True)
 class Written:
-    """One file."""
+    """A written file."""
 
     file: Path
     about: str
 
 
 def pages(root: Path) -> dict[Path, str]:
-    """The pages that have figures of an evaluation, and what they say."""
+    """Return the pages with figures of an evaluation, and their text."""
     found = {file: file.read_text(encoding="utf-8") for pattern in PAGES for file in sorted(root.glob(pattern))}
     return {file: text for file, text in found.items() if _MARK.search(text)}
 
 
 def filled(text: str, blocks: Mapping[str, str]) -> str:
-    """A page with its figures. Raises ValueError: marks that do not pair up, or a name that no block has."""
+    """Return a page with its figures; raises ValueError for unpaired marks, or a name that no block has."""
     whole = _BLOCK.findall(text)
     if len(_MARK.findall(text)) != 2 * len(whole):
         raise ValueError("expected `<!-- evaluation: NAME -->` and `<!-- end -->` in turn, each on a line of its own")
@@ -58,8 +58,8 @@ def publish(
 ) -> list[Written]:
     """Write an evaluation into a checkout; `charts` by their paths beside the summary, `records` packed.
 
-    Raises ValueError, before anything is written, when the checkout has no pages to take the figures or a page's marks
-    are wrong; names the page.
+    Raises ValueError before anything is written if the checkout has no pages for the figures or a page's marks are
+    wrong; the text names the page.
     """
     blocks = all_blocks(content)
     texts = _filled_pages(root, blocks)

@@ -1,4 +1,4 @@
-"""What each redundancy mode avoids and costs: misses against bytes, over the windows in which all that it takes ran."""
+"""Computes what each redundancy mode avoids and costs: misses against bytes, over windows with all necessary runs."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 CHEAPEST = "plr-single"
 MODES = (CHEAPEST, "plr-hedge-10%", "plr-hedge", "plr-adaptive-10%", "plr-adaptive", SUREST)
 NEEDED = frozenset((*DIRECT, CHEAPEST, SUREST))
-"""A window counts when all of these ran in it."""
+"""A window counts if all of these ran in it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -26,14 +26,14 @@ class ModeCost:
     miss_ratio: float
     bytes_per_request: float
     avoided: float | None
-    """Misses of the better direct run of each window that it avoids, as a share of those that `replicate` avoids; None:
-    there are none."""
+    """Misses of the better direct run of each window that it avoids, as a share of those that `replicate` avoids; None
+    if there are none."""
     extra_bytes: float
     """Bytes beyond those of `single`, as a share of them."""
 
 
 def mode_costs(windows: Windows) -> dict[str, ModeCost]:
-    """Mode -> cost."""
+    """Return mode -> cost."""
     complete = [window for window in windows.values() if window.keys() >= NEEDED]
     found = {mode: _cost(mode, [window for window in complete if mode in window]) for mode in MODES}
     return {mode: cost for mode, cost in found.items() if cost is not None}

@@ -1,7 +1,7 @@
-"""Two evaluations of the same windows: does every ratio come out alike?
+"""Compares two evaluations of the same windows: does every ratio come out alike?
 
-A ratio is a mean or a sum over few windows, each with its share of chance. How far two evaluations differ says
-how many digits of a ratio are worth reading.
+A ratio is a mean or a sum over few windows, each partly random. The difference between two evaluations shows how many
+digits of a ratio are meaningful.
 """
 
 from __future__ import annotations
@@ -23,9 +23,9 @@ if TYPE_CHECKING:
     from bench.evaluation.outcome import Figures, Windows
 
 ALIKE = 0.2
-"""Two ratios that differ by no more came out alike."""
+"""Relative difference up to which two ratios count as alike."""
 ENOUGH_MISSES = 30
-"""A ratio of misses is compared when each of both has so many."""
+"""A ratio of misses is compared only if both sides have at least this many."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,7 +37,7 @@ class Repeat:
 
     @property
     def difference(self) -> float:
-        """Of the second from the first, over the first."""
+        """Difference of the second from the first, relative to the first."""
         return abs(self.second - self.first) / abs(self.first)
 
 
@@ -51,7 +51,7 @@ class Repeats:
 
     @property
     def largest(self) -> str | None:
-        """The ratio that differs most."""
+        """Name of the ratio that differs most."""
         return max(self.ratios, key=lambda name: self.ratios[name].difference, default=None)
 
 
@@ -62,7 +62,7 @@ def compare(first: Measured, second: Measured) -> Repeats:
     runs = {scenario: names for scenario, names in runs.items() if names}
     before, after = {}, {}
     for scenario, names in runs.items():
-        # Computed from the trace, not run: the same whenever it is done.
+        # Computed from the trace, not run: the result is always the same.
         ideals = {name: of for by in (other, one) for name, of in by[scenario].items() if name in COMPUTED}
         before[scenario] = ideals | {name: one[scenario][name] for name in names}
         after[scenario] = ideals | {name: other[scenario][name] for name in names}
@@ -112,7 +112,7 @@ def _misses_over_ideal(windows: Iterable[Mapping[str, Figures]]) -> dict[str, fl
 
 
 def table(repeats: Repeats) -> Table:
-    """For people; the largest differences first."""
+    """Return a table with the largest differences first."""
     ordered = sorted(repeats.ratios.items(), key=lambda item: -item[1].difference)
     rows = tuple((name, one.first, one.second, f"{one.difference * 100:.0f} %") for name, one in ordered)
     title = f"The {repeats.runs} runs in {repeats.windows} windows that both evaluations have:"

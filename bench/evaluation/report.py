@@ -1,4 +1,4 @@
-"""All that the records of runs say: verdicts, figures, tables, charts; `page` and `summary` show it."""
+"""Derives everything from the records of runs: verdicts, figures, tables, charts; `page` and `summary` show it."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from bench.evaluation.redundancy_costs import ModeCost
 
 RUNS = "evaluation"
-"""Folder of the records, within that of the reports."""
+"""Folder of the records, within the folder of the reports."""
 _GAINS = ("mean", "p99")
 _COLUMNS = ("", "missed", "never answered", "mean ms", "P50 ms", "P99 ms", "kB/request")
 _MODE_COLUMNS = ("", "windows", "missed", "kB/request", "of replicate's avoided misses", "extra bytes over single")
@@ -42,12 +42,12 @@ class Section:
     charts: tuple[Chart, ...]
     tables: tuple[Table, ...]
     details: tuple[Table, ...] = ()
-    """For those who look closer."""
+    """Tables for a closer look."""
 
 
 @dataclass(frozen=True, slots=True)
 class Report:
-    """Everything."""
+    """Everything that a report shows."""
 
     about: str
     evidence: Evidence
@@ -56,12 +56,12 @@ class Report:
 
 
 def read_records(folder: Path, scenario: str = "*") -> list[Outcome]:
-    """All runs, of one scenario, recorded in a folder of reports. Raises ValueError: not readable; names the file."""
+    """Return the runs recorded in a folder of reports; raises ValueError, which names the file, if unreadable."""
     return [Outcome.read(file) for file in sorted((folder / RUNS).glob(f"{scenario}/*.json"))]
 
 
 def gather(outcomes: Sequence[Outcome], again: Measured | None = None) -> Report:
-    """Everything, from at least one run; `again`: another evaluation of the same windows."""
+    """Make a report from at least one run; `again` is another evaluation of the same windows."""
     found = studies(outcomes)
     void = sum(bool(one.disturbances) for one in outcomes)
     windows = len({one.scenario for one in outcomes})
@@ -80,7 +80,7 @@ def gather(outcomes: Sequence[Outcome], again: Measured | None = None) -> Report
 
 
 def machine_of(outcomes: Iterable[Outcome]) -> dict[str, Any]:
-    """What the newest run was measured on, and when; empty: no record says."""
+    """Return the machine and time of the newest run; empty if no record has them."""
     known: list[dict[str, Any]] = [one.conditions["machine"] for one in outcomes if "machine" in one.conditions]
     return max(known, key=lambda machine: str(machine.get("measured_at", "")), default={})
 
@@ -88,7 +88,7 @@ def machine_of(outcomes: Iterable[Outcome]) -> dict[str, Any]:
 def as_json(
     outcomes: Sequence[Outcome], failed: Sequence[str], again: Measured | None = None, drives: Drives | None = None
 ) -> dict[str, Any]:
-    """Every figure of the report; `drives`: which recorded windows are one drive, if that is known."""
+    """Return every figure of the report; `drives` says which recorded windows are one drive, if known."""
     evidence = findings.gather(outcomes, again)
     found = studies(outcomes)
     runs: dict[str, dict[str, Any]] = {}
@@ -125,7 +125,7 @@ def as_json(
 
 
 def window_table(scenario: str, outcomes: Iterable[Outcome]) -> Table:
-    """What everybody did in one window."""
+    """Return a table of all contenders in one window."""
     runs = {one.contender: one for one in outcomes if one.scenario == scenario}
     rows = tuple(
         (*_row(name, runs[name].figures()), "void" if runs[name].disturbances else "") for name in ranked(runs)
@@ -137,7 +137,7 @@ def window_table(scenario: str, outcomes: Iterable[Outcome]) -> Table:
 
 
 def modes_table(costs: Mapping[str, ModeCost]) -> Table:
-    """What each redundancy mode avoids and costs."""
+    """Return a table of what each redundancy mode avoids and costs."""
     rows = tuple(
         (
             name,
@@ -225,7 +225,7 @@ def _pooled_as_json(study: Study) -> dict[str, Any]:
 
 
 def _everywhere_as_json(outcomes: Sequence[Outcome], drives: Drives | None) -> list[dict[str, Any]]:
-    """All drives, then those in which every mode ran: what each did there."""
+    """Return the results in all drives, then in those in which every mode ran."""
     found: list[dict[str, Any]] = []
     windows = figures_by_window(outcomes)
     for names in ((*others.OTHERS, SUREST, IDEAL, ORACLE), (*others.OTHERS, *others.PLR, IDEAL, ORACLE)):
@@ -233,7 +233,7 @@ def _everywhere_as_json(outcomes: Sequence[Outcome], drives: Drives | None) -> l
         if one is None:
             continue
         if found and len(one.windows) == len(found[0]["windows"]):
-            found.clear()  # the modes ran in all of them: one table has everybody
+            found.clear()  # the modes ran in all of them: one table shows all contenders
         kept = {name: windows[name] for name in one.windows}
         contenders = {
             name: {
@@ -250,7 +250,7 @@ def _everywhere_as_json(outcomes: Sequence[Outcome], drives: Drives | None) -> l
 
 
 def _alike(windows: Windows, contender: str, drives: Drives | None) -> float | None:
-    """Its miss ratio if each distinct drive weighs the same, however many windows replay it; None: not known."""
+    """Return its miss ratio with equal weight for each drive, however many windows replay it; None if unknown."""
     if drives is None:
         return None
     of_drives = [
@@ -267,7 +267,7 @@ def _miss_ratio(by_name: Mapping[str, Figures], contender: str) -> float:
 
 
 def _measured_as_json(outcomes: Iterable[Outcome]) -> dict[str, Any]:
-    """How many were run, when, and of which commits; runs before commits were recorded have none."""
+    """Return how many were run, when, and at which commits; early runs recorded no commit."""
     kept = [one for one in outcomes if one.contender not in COMPUTED]
     known: list[dict[str, Any]] = [one.conditions["machine"] for one in kept if "machine" in one.conditions]
     times = sorted(str(one["measured_at"]) for one in known if "measured_at" in one)

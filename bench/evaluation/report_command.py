@@ -1,4 +1,4 @@
-"""`python -m bench report`: the evaluation's reports anew from the records of runs; nothing is run."""
+"""`python -m bench report`: remakes the evaluation's reports from the records of runs; nothing is run."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ DATA, PAGE, SUMMARY = publish.DATA, "evaluation.html", publish.SUMMARY
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Options of `python -m bench report`."""
+    """Add the options of `python -m bench report`."""
     parser.add_argument(
         "--out",
         type=Path,
@@ -60,7 +60,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    """Write the reports; returns the exit code, 2 when there is nothing to report or it is not readable."""
+    """Write the reports and return the exit code, 2 if there is nothing to report or it is not readable."""
     try:
         outcomes = report.read_records(options.out)
         if not outcomes:
@@ -86,7 +86,7 @@ def write(
 ) -> None:
     """Write the reports of at least one run to the folder, and to the checkout if one is given; show the verdicts.
 
-    Raises ValueError: the checkout has no places for the figures.
+    Raises ValueError if the checkout has no places for the figures.
     """
     whole = report.gather(outcomes, again)
     content = report.as_json(outcomes, failed, again, drives or _drives_before(folder / DATA))
@@ -113,7 +113,7 @@ def write(
 
 
 def _again(path: Path, out: Path) -> Measured:
-    """The other evaluation. Raises ValueError: it is the same one, or there is none."""
+    """Return the other evaluation; raises ValueError if it is the same one, or there is none."""
     if path.resolve() in (out.resolve(), (out / DATA).resolve()):
         raise ValueError(f"--again {path}: expected another evaluation than --out")
     if path.is_file():
@@ -129,12 +129,12 @@ def _no_records(folder: Path) -> ValueError:
 
 
 def _failed_before(file: Path) -> list[str]:
-    """What the file says of runs that failed, which no record does."""
+    """Return the failed runs that the file names; no record does."""
     return list(_before(file).get("failed", []))
 
 
 def _drives_before(file: Path) -> Drives | None:
-    """What the file says of which windows are one drive, which takes the traces to find."""
+    """Return from the file which windows are one drive; finding out needs the traces."""
     found = _before(file).get("drives")
     if not isinstance(found, dict):
         return None

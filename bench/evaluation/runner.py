@@ -1,4 +1,4 @@
-"""One scenario with one contender in the lab: start all on a good network, replay the window, keep the records."""
+"""Runs a scenario with a contender in the lab: starts all on a good network, replays the window, keeps the records."""
 
 from __future__ import annotations
 
@@ -21,22 +21,22 @@ if TYPE_CHECKING:
     from lab import LinkStats
 
 WARM_UP_S = 3.0
-"""Of the scenario's requests, on the good network, before the window."""
+"""Seconds of the scenario's requests on the good network before the window."""
 LEAD_S = 1.0
-"""From the order to replay to the window's begin: by then links and client have it."""
+"""Time from the order to replay to the start of the window: by then links and client have received it."""
 DRAIN_S = 30.0
-"""By then a client that was blocked has ended its run, once the links are good again."""
+"""Time by which a blocked client has ended its run, once the links are good again."""
 MOST_LATE_S = 0.005
-"""P99 of the emulator's packets behind their time; more disturbs a run."""
+"""Tolerated P99 lateness of the emulator's packets; more disturbs a run."""
 MOST_LATE_STEP_S = 0.1
-"""The worst step of the trace behind its time."""
+"""Tolerated lateness of the worst step of the trace."""
 
 
 def run(scenario: Scenario, contender: Contender, folder: Path, *, seed: int = 1) -> Outcome:
-    """Run it. Logs go to `folder`.
+    """Run a scenario with a contender; logs go to `folder`.
 
     Raises:
-        LabError, LabConfigError: the lab or the trace.
+        LabError, LabConfigError: the lab or the trace failed.
         SystemFailureError, RemoteError, RuntimeError: the contender did not start, or ended.
     """
     traffic = scenario.traffic
@@ -79,7 +79,7 @@ def run(scenario: Scenario, contender: Contender, folder: Path, *, seed: int = 1
 
 
 def disturbances(links: Mapping[str, LinkStats], busy: float | None) -> tuple[str, ...]:
-    """Why a run says more about the machine than about the contender; nothing: it counts."""
+    """Return why a run says more about the machine than about the contender; empty if it counts."""
     found = []
     for name, stats in links.items():
         if stats.lateness.p99_s > MOST_LATE_S:
@@ -102,14 +102,14 @@ def _call(clients: Sequence[Remote], plan: Mapping[str, Any]) -> None:
 
 
 def _finish(clients: Sequence[Remote], lab: Lab, carriers: Sequence[str]) -> list[Calls]:
-    """The clients' logs. What they are still blocked with may leave now; no answer counts any more."""
+    """Return the clients' logs; requests still blocked may leave now, but no answer counts any more."""
     for name in carriers:
         lab.link(name).set(WARM)
     return [Calls.of(client.finish(DRAIN_S)) for client in clients]
 
 
 def _requests(logs: Sequence[Calls], start: float, scenario: Scenario) -> tuple[Request, ...]:
-    """Each request with the first moment at which it left, and its first answer."""
+    """Return each request with the first time at which it left, and its first answer."""
     requests = []
     for number in range(scenario.count):
         sent = [log.sent_s[number] - start for log in logs if number < len(log.sent_s)]

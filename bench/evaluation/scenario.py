@@ -1,4 +1,4 @@
-"""Scenarios: what is asked over which two paths, read from the YAML files of a folder.
+"""Reads scenarios from the YAML files of a folder: what is requested over which two paths.
 
 name: drive              # what it is called, with the seed or the trace's name after it
 case: A                  # case study of docs/develop/evaluation.md
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
 FOLDER = Path(__file__).with_name("scenarios")
 HEADER_BYTES = 16
-"""The smallest request and answer: what a contender needs to tell one from another."""
+"""Size of the smallest request and answer, which a contender needs to tell one from another."""
 
 
 def _known_kind(name: str) -> str:
@@ -44,21 +44,21 @@ class _Section(BaseModel):
 
 
 class Traffic(_Section):
-    """What is asked."""
+    """The requests of a scenario."""
 
     request_bytes: Annotated[int, Field(ge=HEADER_BYTES, le=10_000_000)]
     answer_bytes: Annotated[int, Field(ge=HEADER_BYTES, le=10_000_000)]
     rate_hz: Annotated[float, Field(gt=0, le=1000)]
     deadline_ms: Annotated[float, Field(gt=0, le=10_000)]
     compute_ms: Annotated[float, Field(ge=0, le=10_000)]
-    """How long a server takes for each request, one at a time."""
+    """Time that a server takes for each request, one at a time."""
     stall_ms: Annotated[float, Field(ge=0, le=60_000)] = 0.0
-    """How much longer the first server, that of carrier a where each has its own, takes now and then ..."""
+    """Extra time that the first server (that of carrier a if each has its own) takes at times ..."""
     stall_every: Annotated[int, Field(ge=0)] = 0
-    """... namely for every so-manieth request; 0: never."""
+    """... namely for one in this many requests; 0 means never."""
 
     def compute(self, *, first: bool) -> dict[str, Any]:
-        """Arguments of `bench.dataplane.calling.Compute`, for the first or any other server."""
+        """Return the arguments of `bench.dataplane.calling.Compute` for the first or any other server."""
         stall_s, every = (self.stall_ms / 1e3, self.stall_every) if first else (0.0, 0)
         return {"compute_s": self.compute_ms / 1e3, "stall_s": stall_s, "stall_every": every}
 
@@ -67,7 +67,7 @@ class _Network(_Section):
     generator: Annotated[str, AfterValidator(_known_kind)] | None = None
     seeds: Annotated[tuple[int, ...], Field(min_length=1)] = (1,)
     traces: str | None = None
-    """Glob of names."""
+    """Glob pattern of trace names."""
     of_each_family: Annotated[int, Field(ge=1)] = 1
 
     @model_validator(mode="after")
@@ -78,7 +78,7 @@ class _Network(_Section):
 
 
 class ScenarioFile(_Section):
-    """One file."""
+    """The content of a scenario file."""
 
     name: Annotated[str, Field(pattern=r"^[a-z][a-z0-9-]{0,40}$")]
     case: Literal["A", "B", "C", "D", "E", "F", "G"]
@@ -90,7 +90,7 @@ class ScenarioFile(_Section):
 
 @dataclass(frozen=True, slots=True)
 class Scenario:
-    """One window of one network, and what is asked in it."""
+    """A window of a network, and the requests in it."""
 
     name: str
     case: str
@@ -98,25 +98,25 @@ class Scenario:
     duration_s: float
     traffic: Traffic
     kind: str | None = None
-    """Of the generator; None: recorded."""
+    """Kind of the generator; None if recorded."""
     seed: int = 0
     window: Window | None = None
-    """Of a recorded trace."""
+    """Window of a recorded trace."""
 
     @property
     def count(self) -> int:
-        """Requests in the window; number k is due at k / rate_hz."""
+        """Number of requests in the window; request k is due at k / rate_hz."""
         return int(self.duration_s * self.traffic.rate_hz)
 
     def trace(self) -> Trace:
-        """The window's trace, its clock beginning with the window. Raises LabConfigError: not readable."""
+        """Return the window's trace, whose clock starts with it; raises LabConfigError if it is not readable."""
         if self.window is not None:
             return self.window.load()
         assert self.kind is not None
         return generate(self.kind, self.seed, self.duration_s)
 
     def shortened(self, duration_s: float) -> Scenario:
-        """At most this long: a shorter generated window, the middle of a recorded one; another name, if shorter."""
+        """Return at most this length of it, renamed if shorter: generated shorter, or the middle of a recording."""
         if duration_s >= self.duration_s:
             return self
         window = None if self.window is None else self.window.middle(duration_s)
@@ -124,10 +124,10 @@ class Scenario:
 
 
 def read_scenarios(traces: Sequence[TraceEntry], folder: Path = FOLDER) -> list[Scenario]:
-    """All scenarios of a folder's files; of recorded traces those that are there.
+    """Return all scenarios of a folder's files; of the recorded ones, those whose traces are present.
 
     Raises:
-        ConfigError: names file and key.
+        ConfigError: a file is invalid; the text names file and key.
     """
     files = (
         validate(ScenarioFile, parse_yaml(read_text(path), str(path)), str(path))

@@ -1,4 +1,4 @@
-"""`python -m bench scenarios`: what there is to replay, what the ideals make of it, the generator beside the traces."""
+"""`python -m bench scenarios`: shows what can be replayed, the ideals' results, and the generator beside the traces."""
 
 from __future__ import annotations
 
@@ -23,18 +23,18 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
 WIDE = 200
-"""Columns, where the output is no terminal."""
+"""Columns if the output is not a terminal."""
 RECORDED = {"drive": "drive-att-vz", "satellite": "drive-att-mob", "indoor": "walk-wifi-cellular-11"}
 """Kind of the generator -> the family of recorded traces that it stands for."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Options of `python -m bench scenarios`."""
+    """Add the options of `python -m bench scenarios`."""
     parser.add_argument("--traces", type=Path, help="folder of recorded traces; default: made-up scenarios alone")
 
 
 def run(options: argparse.Namespace) -> int:
-    """Show the tables; returns the exit code, 2 when something is not readable."""
+    """Show the tables and return the exit code, 2 if something is not readable."""
     try:
         traces = read_folder(options.traces) if options.traces else []
         tables = [_ideals(read_scenarios(traces)), _statistics(traces)]
@@ -59,7 +59,7 @@ def _ideals(scenarios: Sequence[Scenario]) -> Table:
 
 
 def _statistics(traces: Sequence[TraceEntry]) -> Table:
-    """The generator's kinds as stated, each with the recorded family that it stands for, if there is one."""
+    """Return the generator's kinds as stated, each with the recorded family that it stands for, if there is one."""
     rows = []
     for name, kind in KINDS.items():
         rows += _rows(f"{name}, stated", stated(kind))

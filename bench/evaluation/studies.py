@@ -1,8 +1,8 @@
-"""Windows that belong together, and what contenders did in the same ones of them.
+"""Groups windows that belong together, and pools contenders over the same ones.
 
-Recorded windows of a case study are one study, made-up windows of one scenario file another. What is compared is pooled
-over the same windows for everybody: those in which both direct runs, ours and the ideal ran. Who else did not run in
-most of them is left out, and a window in which one of the others is missing, or void, does not count.
+Recorded windows of a case study are one study, generated windows of one scenario file another. Contenders are pooled
+over the same windows: those in which both direct runs, ours and the ideal ran. A contender that did not run in most of
+them is left out, and a window in which one of the others is missing, or void, does not count.
 """
 
 from __future__ import annotations
@@ -30,17 +30,17 @@ CASES = {
     "G": "two radios of one operator",
 }
 SHOWN = (*CONTENDERS, IDEAL)
-"""In charts; each path's ideal alone stands in the tables only."""
+"""Contenders in charts; the ideal of each path alone appears only in the tables."""
 ANCHORS = (*DIRECT, SUREST, IDEAL)
-"""Windows are pooled in which these ran, those of them that ran at all."""
+"""Only windows in which these ran are pooled, as far as they ran at all."""
 SHOWN_SHARE = 0.75
-"""Whoever else ran in less than this share of them is left out."""
+"""Other contenders that ran in less than this share of them are left out."""
 
 _NAME = re.compile(r"(?P<stem>.+?)(?P<recorded>-at-[\d.]+)?(?P<shortened>-[\d.]+s)?")
 
 
 def is_recorded(scenario: str) -> bool:
-    """Whether a scenario of this name replays a whole window of a recorded trace."""
+    """Return whether a scenario of this name replays a whole window of a recorded trace."""
     return bool((match := _NAME.fullmatch(scenario)) and match["recorded"] and not match["shortened"])
 
 
@@ -52,10 +52,10 @@ class Pool:
     """Contender -> its run in each of `windows`."""
     windows: tuple[str, ...]
     left_out: dict[str, int]
-    """Contender -> windows in which it ran; too few."""
+    """Contender -> number of windows in which it ran, which are too few."""
 
     def together(self, contender: str) -> Outcome:
-        """All its requests as one run."""
+        """Return all requests of a contender as one run."""
         return together(self.runs[contender])
 
 
@@ -64,7 +64,7 @@ class Study:
     """Windows that belong together."""
 
     name: str
-    """For files."""
+    """Name for files."""
     title: str
     case: str
     recorded: bool
@@ -72,13 +72,13 @@ class Study:
     """Scenario -> contender -> run; none is void."""
 
     def hardest(self, contenders: Sequence[str]) -> str | None:
-        """The window with most misses of the two direct runs together, where all these ran; None: there is none."""
+        """Return the window with most misses of both direct runs, among those where all these ran; None without any."""
         able = [name for name, runs in self.windows.items() if {*contenders, *DIRECT} <= runs.keys()]
         return max(able, key=lambda name: sum(self.windows[name][one].figures().misses for one in DIRECT), default=None)
 
 
 def studies(outcomes: Iterable[Outcome]) -> list[Study]:
-    """In order of case, recorded ones first."""
+    """Return the studies in order of case, recorded ones first."""
     found: dict[_Key, dict[str, dict[str, Outcome]]] = {}
     for scenario, runs in by_window(outcomes).items():
         found.setdefault(_key(scenario, next(iter(runs.values())).case), {})[scenario] = runs
@@ -89,7 +89,7 @@ def studies(outcomes: Iterable[Outcome]) -> list[Study]:
 
 
 def study_of(scenario: str, case: str) -> str:
-    """The name of the study that a scenario of this case belongs to."""
+    """Return the name of the study that a scenario of this case belongs to."""
     return _key(scenario, case).study
 
 
@@ -113,7 +113,7 @@ def _key(scenario: str, case: str) -> _Key:
 def pool(
     windows: Mapping[str, Mapping[str, Outcome]], names: Sequence[str] = SHOWN, anchors: Iterable[str] = ANCHORS
 ) -> Pool | None:
-    """What the contenders among `names` did in the same windows; None: nobody ran."""
+    """Pool what the contenders among `names` did in the same windows; return None if none ran."""
     needed = {name for name in anchors if any(name in runs for runs in windows.values())}
     windows = {window: runs for window, runs in windows.items() if runs.keys() >= needed} or windows
     ran = Counter(name for runs in windows.values() for name in runs if name in names)
@@ -130,6 +130,6 @@ def pool(
 
 
 def ranked(names: Iterable[str]) -> list[str]:
-    """Contenders in the order in which tables and charts have them."""
+    """Return contenders in the order of tables and charts."""
     order = (*CONTENDERS, *COMPUTED)
     return sorted(names, key=lambda name: order.index(name) if name in order else len(order))

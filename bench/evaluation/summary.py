@@ -1,4 +1,4 @@
-"""The evaluation as Markdown: the page without the tables of every window; charts are files beside it."""
+"""Renders the evaluation as Markdown: the page without the tables of every window; charts are files beside it."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ if TYPE_CHECKING:
     from bench.evaluation.report import Report, Section
 
 CHARTS = "evaluation-charts"
-"""Folder of the charts, beside the summary."""
+"""Folder of the charts beside the summary."""
 
 
 def render(report: Report) -> str:
-    """The whole file."""
+    """Return the whole file."""
     figures, notes = report.evidence.figures, report.evidence.notes
     columns = ("figure", "what", "value", "wanted", "verdict", "from")
     rows = tuple(

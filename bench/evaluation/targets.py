@@ -1,4 +1,4 @@
-"""What the evaluation's figures are held against; `findings` has where they come from."""
+"""Defines the targets of the evaluation's figures; `findings` computes the figures."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
-"""What a two-path trace is like, measured; and what the generator's parameters say that it should be like.
+"""Measures statistics of a two-path trace, and derives those that follow from the generator's parameters.
 
-Of the uplink: rates at some probabilities, autocorrelation, outages; of both paths together: Spearman's rank
-correlation, and how much more often than by chance both are too slow at once.
+For the uplink these are rates at some probabilities, autocorrelation and outages. For both paths together they are
+Spearman's rank correlation, and how much more often than by chance both are too slow at once.
 """
 
 from __future__ import annotations
@@ -26,27 +26,27 @@ if TYPE_CHECKING:
 SHOWN = (0.05, 0.25, 0.5, 0.75, 0.95)
 LAGS_S = (1.0, 5.0, 20.0)
 LOW_KBPS = 5_000.0
-"""About what 120 kB five times a second need."""
+"""Approximate rate that 120 kB five times a second need."""
 
 
 @dataclass(frozen=True, slots=True)
 class PathStatistics:
-    """One path. NaN: it cannot be told."""
+    """Statistics of one path; NaN if unknown."""
 
     rates_kbps: tuple[float, ...]
-    """At SHOWN."""
+    """Rates at the probabilities SHOWN."""
     autocorrelation: tuple[float, ...]
-    """Of the rate's normal scores, at LAGS_S."""
+    """Autocorrelation of the rate's normal scores, at LAGS_S."""
     low_share: float
     """Share of time below LOW_KBPS."""
     outage_share: float
     outage_s: float
-    """Mean length of a stretch of rate 0."""
+    """Mean length of a period of rate 0."""
 
 
 @dataclass(frozen=True, slots=True)
 class PairStatistics:
-    """Both paths."""
+    """Statistics of both paths."""
 
     a: PathStatistics
     b: PathStatistics
@@ -57,7 +57,7 @@ class PairStatistics:
 
 
 def measure(traces: Sequence[Trace]) -> PairStatistics:
-    """Statistics of traces of one family, taken together; the correlation is the median of the traces'."""
+    """Return the joint statistics of traces of one family; the correlation is the median over the traces."""
     pairs = [(_rates(trace, "a"), _rates(trace, "b")) for trace in traces]
     step_s = traces[0].paths["a"][1].at_s
     low = np.concatenate([np.stack([a < LOW_KBPS, b < LOW_KBPS]) for a, b in pairs], axis=1)
@@ -72,7 +72,7 @@ def measure(traces: Sequence[Trace]) -> PairStatistics:
 
 
 def stated(kind: Kind) -> PairStatistics:
-    """What follows from a kind's parameters, its blackouts aside.
+    """Return the statistics that follow from a kind's parameters, without its blackouts.
 
     The rank correlation is that of the scores alone, which outages and dead zones change a little.
     """
@@ -80,7 +80,7 @@ def stated(kind: Kind) -> PairStatistics:
     dead = kind.dead_share
     low = [_low(carrier, LOW_KBPS) for carrier in (kind.a, kind.b)]
     high_scores = multivariate_normal(mean=[0, 0], cov=[[1, correlation], [correlation, 1]])
-    # Both above: by symmetry, both scores below the negative of where they stop being low.
+    # Share with both above: by symmetry, with both scores below the negative of where they stop being low.
     limits = [-norm.ppf(carrier.probability_below(LOW_KBPS)) for carrier in (kind.a, kind.b)]
     both_high = (1 - kind.a.outage_share) * (1 - kind.b.outage_share) * float(high_scores.cdf(limits))
     both_low = dead + (1 - dead) * (low[0] + low[1] - 1 + both_high)
@@ -117,7 +117,7 @@ def _autocorrelation(scores: Sequence[Floats], lag: int) -> float:
 
 
 def _score_correlation(kind: Kind) -> float:
-    """Correlation of two sums of autoregressive processes whose innovations are correlated."""
+    """Return the correlation of two sums of autoregressive processes with correlated innovations."""
     a, b = kind.a, kind.b
 
     def kept(a_s: float, b_s: float) -> float:
@@ -130,7 +130,7 @@ def _score_correlation(kind: Kind) -> float:
 
 
 def _low(carrier: Carrier, rate_kbps: float) -> float:
-    """Share of time below a rate, dead zones aside."""
+    """Return the share of time below a rate, without dead zones."""
     return carrier.outage_share + (1 - carrier.outage_share) * carrier.probability_below(rate_kbps)
 
 

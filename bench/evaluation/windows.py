@@ -1,8 +1,9 @@
-"""Which stretch of which recorded trace is replayed: chosen by a rule, never by what comes out.
+"""Chooses which part of which recorded trace is replayed: by a rule, never by the result.
 
-The rule. Traces belong to one family when their names differ in the number at the end only: the same two networks. Of
-each family, in order of name, come so many at even distances, beginning with the first, of those that are long enough;
-and of each trace the stretch around its middle. Round-trip traces (`rtt`) know nothing of capacity and are left out.
+The rule: traces belong to one family if their names differ only in the number at the end, that is, they have the same
+two networks. Of each family's traces that are long enough, in order of name, a number of evenly spaced ones is chosen,
+beginning with the first; and of each trace the part around its middle. Round-trip traces (`rtt`) do not show capacity
+and are left out.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class Window:
-    """A stretch of a recorded trace."""
+    """A part of a recorded trace."""
 
     entry: TraceEntry
     start_s: float
@@ -33,16 +34,16 @@ class Window:
         return f"{self.entry.name}-at-{self.start_s:g}"
 
     def middle(self, length_s: float) -> Window:
-        """A shorter window around the middle of this one."""
+        """Return a shorter window around the middle of this one."""
         return replace(self, start_s=self.start_s + (self.length_s - length_s) / 2, length_s=length_s)
 
     def load(self) -> Trace:
-        """Its trace; the clock begins with the window, both paths stay on it. Raises LabConfigError."""
+        """Read its trace; both paths share a clock that starts with the window. Raises LabConfigError."""
         return cut(self.entry.load(), self.start_s, self.length_s)
 
 
 def choose(traces: Sequence[TraceEntry], names: str, of_each_family: int, length_s: float) -> list[Window]:
-    """The windows that the rule above gives for traces whose name matches the glob."""
+    """Return the windows that the rule above gives for traces whose name matches the glob."""
     families: dict[str, list[TraceEntry]] = {}
     for entry in sorted(traces, key=lambda one: one.name):
         if entry.kind == "rate" and entry.duration_s >= length_s and fnmatch.fnmatch(entry.name, names):
@@ -59,7 +60,7 @@ def _spread(family: Sequence[TraceEntry], count: int) -> Sequence[TraceEntry]:
 
 
 def cut(trace: Trace, start_s: float, length_s: float) -> Trace:
-    """The stretch of a trace from `start_s` on. Its last step stays in force when the window is over."""
+    """Return the part of a trace from `start_s` on; its last step stays in force after the window."""
     paths = {}
     for name, steps in trace.paths.items():
         before = [step for step in steps if step.at_s <= start_s]
