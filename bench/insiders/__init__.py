@@ -1,5 +1,5 @@
-"""A robot and a cloud of the fleet that were taken over attack it in every way they can, all at once, for minutes.
+"""Lets a compromised robot and a compromised cloud attack the fleet in every way they can, all at once, for minutes.
 
-Two honest robots and two honest clouds go on beside them (`stage`), undisturbed at first, then attacked, then left
-alone again, all the while the same processes (`command`). `report` judges by limits that stand there.
+Two honest robots and two honest clouds keep working beside them (`stage`): undisturbed at first, then attacked, then
+left alone again, with the same processes throughout (`command`). `report` judges by the limits defined there.
 """

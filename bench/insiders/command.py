@@ -28,18 +28,18 @@ if TYPE_CHECKING:
 SAMPLE_EVERY_S = 5.0
 SHOW_EVERY_S = 0.5
 NON_TTY_EVERY = 20
-"""Without a terminal only every so many lines of progress are shown."""
+"""Without a terminal, only one in this many lines of progress is shown."""
 REST_S = 15.0
-"""After the attack, before it counts as undisturbed again: sessions that the insiders left half open end."""
+"""Time after the attack before the fleet counts as undisturbed again: sessions that the insiders left half open end."""
 WARM_UP_S = 5.0
 PAGE_WIDTH = 180
 CYCLE_S = 30.0
-"""From one restart of an insider's program to the next."""
+"""Interval between restarts of an insider's program."""
 _PROGRESS = re.compile(r"sent\s+(\d+)\s+unanswered\s+(\d+)")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Options of `python -m bench insiders`."""
+    """Add the options of `python -m bench insiders`."""
     parser.add_argument("--minutes", type=float, default=10.0, help="length of the attack (default %(default)s)")
     parser.add_argument(
         "--quiet-minutes", type=float, default=2.0, help="undisturbed before, and after (default %(default)s each)"
@@ -58,7 +58,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    """Run and write insiders.json; returns the exit code: 1 when a limit is missed."""
+    """Run, write insiders.json and return the exit code: 1 if a limit is missed."""
     console = Console(highlight=False, soft_wrap=True)
     if not console.is_terminal:
         console.width = PAGE_WIDTH
@@ -84,7 +84,7 @@ def insiders(
     seed: int = 1,
     apart: bool = False,
 ) -> Outcome:
-    """One run in a lab of its own. `apart`: the insiders take no processor that an honest program wants."""
+    """Do one run in a lab of its own; with `apart` the insiders take no processor that an honest program wants."""
     with make_lab(seed) as lab:
         stage = Stage(lab, folder)
         try:
@@ -184,7 +184,7 @@ class _Run:
         return "   ".join((*counts, self._load))
 
     def _spent(self) -> dict[str, float]:
-        """Processor time of the insiders."""
+        """Return the processor time of the insiders."""
         parts = self._stage.system.parts
         pids = {name: parts[name].process.inner_pid for name in INSIDERS}
         return {name: 0.0 if pid is None else processor_s(pid) for name, pid in pids.items()}

@@ -1,4 +1,4 @@
-"""By which of their counters the honest programs tell of each attack (docs/operate/metrics.md)."""
+"""Lists which counters of the honest programs show each attack (docs/operate/metrics.md)."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ INTERESTING = (
     "bridge_unanswered",
     "departures",
 )
-"""Beginnings of the counters of what was refused, without `plr_` and `_total`."""
+"""Prefixes of the counters of refusals, without `plr_` and `_total`."""
 
 COUNTED: dict[str, tuple[str, ...]] = {
     "256 addresses of a third party": ("messages_dropped bad_candidates", "messages_dropped old_candidates"),

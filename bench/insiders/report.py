@@ -1,4 +1,4 @@
-"""Judges a run, and writes what it was."""
+"""Judges a run, and writes a report of it."""
 
 from __future__ import annotations
 
@@ -27,50 +27,50 @@ if TYPE_CHECKING:
     from bench.churn.samples import Growth
     from bench.insiders.stage import Workload
 
-# The limits. Those of latency and of spoofed bytes were written down before the first run; what addresses that a member
-# announces may be sent was added after it, as limits.md has it, because the third party is among them.
+# The limits. Those of latency and of spoofed bytes were written down before the first run. What may be sent to
+# addresses that a member announces was added after it, as in limits.md, because the third party is among them.
 MAX_P99_RATIO = 1.5
-"""P99 attacked over P99 undisturbed, of each client."""
+"""P99 while attacked over P99 undisturbed, for each client."""
 MAX_THIRD_PARTY_RATIO = 3.0
-"""Bytes that reach the third party over those that the insiders sent in its name (RFC 9000 section 8.1), beside what
+"""Bytes that reach the third party over those that the insiders sent in its name (RFC 9000 section 8.1), besides what
 each honest interface may send to addresses that a peer announces and has not proven (docs/operate/limits.md)."""
 UNPROVEN_LINKS = len(ROBOTS) * len(PROFILES) + len(CLOUDS)
 """Honest interfaces, each of which knows one of the insiders."""
 SETTLE_S = 3.0
-"""Requests sent so shortly before or after the attack begins or ends count in neither."""
+"""Requests sent within this time of the start or end of the attack count in neither phase."""
 MIN_SAMPLES = 200
-"""Fewer requests have no P99."""
+"""Least number of requests for a P99."""
 
 BAD_LINES = (b"Traceback", b"internal error")
 _CONTROL_CHARACTERS = re.compile(rb"[\x00-\x08\x0b-\x1f\x7f]|\xc2[\x80-\x9f]|\xe2\x80[\xaa-\xae]")
 
 
 class Phase(NamedTuple):
-    """A stretch of the run, CLOCK_MONOTONIC."""
+    """A period of the run, in CLOCK_MONOTONIC."""
 
     began_s: float
     ended_s: float
 
     @property
     def length_s(self) -> float:
-        """Seconds."""
+        """Length in seconds."""
         return self.ended_s - self.began_s
 
     def of(self, calls: Calls) -> list[float]:
-        """The latencies of what was sent well within it, ms."""
+        """Return the latencies of requests sent well within it, ms."""
         return calls.between(self.began_s + SETTLE_S, self.ended_s - SETTLE_S).answered_ms()
 
 
 @dataclass(frozen=True, slots=True)
 class Records:
-    """What one client left."""
+    """The records of one client."""
 
     summary: dict[str, Any]
     calls: Calls
 
     @classmethod
     def of(cls, content: dict[str, Any]) -> Self:
-        """Read its file."""
+        """Read the content of its file."""
         requests = content["requests"]
         latencies = tuple(None if one["latency_ms"] is None else one["latency_ms"] / 1e3 for one in requests)
         return cls(content["summary"], Calls(tuple(one["sent_s"] for one in requests), latencies))
@@ -78,7 +78,7 @@ class Records:
 
 @dataclass(slots=True)
 class Outcome:
-    """All that is known after a run."""
+    """Everything known after a run."""
 
     before: Phase
     attacked: Phase
@@ -86,7 +86,7 @@ class Outcome:
     records: dict[Workload, Records]
     tallies: dict[str, dict[str, list[int]]]
     counted: dict[str, float]
-    """`host/series`: by how much it grew during the attack."""
+    """Growth of each `host/series` during the attack."""
     third_party_bytes: int
     insiders_s: dict[str, float]
     """Processor time of each insider during the attack."""
@@ -96,21 +96,21 @@ class Outcome:
     failures: list[str] = field(default_factory=list)
 
     def quiet(self, workload: Workload) -> list[float]:
-        """Latencies before and after the attack, ms."""
+        """Return the latencies before and after the attack, ms."""
         calls = self.records[workload].calls
         return self.before.of(calls) + self.after.of(calls)
 
     def troubled(self, workload: Workload) -> list[float]:
-        """Latencies while attacked, ms."""
+        """Return the latencies while attacked, ms."""
         return self.attacked.of(self.records[workload].calls)
 
     def ratio(self, workload: Workload) -> float | None:
-        """P99 attacked over undisturbed; None when there were too few requests to tell."""
+        """Return the P99 while attacked over undisturbed; None if there were too few requests."""
         quiet, troubled = self.quiet(workload), self.troubled(workload)
         return p99_ratio(troubled, quiet) if min(len(quiet), len(troubled)) >= MIN_SAMPLES else None
 
     def attacks(self) -> dict[str, list[int]]:
-        """By attack, over all insiders: how often, messages, bytes."""
+        """Return runs, messages and bytes of each attack, over all insiders."""
         sums: dict[str, list[int]] = {}
         for tally in self.tallies.values():
             for attack, counts in tally.items():
@@ -119,7 +119,7 @@ class Outcome:
         return dict(sorted(sums.items()))
 
     def growths(self) -> list[Growth]:
-        """How the honest programs grew over the second half of the attack."""
+        """Return how the honest programs grew over the second half of the attack."""
         began = self.attacked.began_s - self.zero_s
         length_s = self.attacked.length_s
         found = []
@@ -134,7 +134,7 @@ class Outcome:
         return found
 
     def requests_verdicts(self) -> list[str]:
-        """What is wrong with the honest robots' requests, whatever the latencies."""
+        """Return what is wrong with the honest robots' requests, apart from latencies."""
         found = []
         for workload, records in self.records.items():
             summary = records.summary
@@ -144,7 +144,7 @@ class Outcome:
         return [*self.failures, *found]
 
     def verdicts(self) -> list[str]:
-        """Why the run failed; empty when it did not."""
+        """Return why the run failed; empty if it did not."""
         found = self.requests_verdicts()
         for workload in self.records:
             ratio = self.ratio(workload)
@@ -160,7 +160,7 @@ class Outcome:
         return found
 
     def third_party_limit(self) -> float:
-        """What may reach the third party, bytes."""
+        """Return how many bytes may reach the third party."""
         in_its_name = sum(self.attacks().get(attack, [0, 0, 0])[2] for attack in spoofed())
         length_s = self.after.ended_s - self.attacked.began_s
         looked_at = UNPROVEN_LINKS * (UNPROVEN_BYTES + UNPROVEN_BYTES_PER_S * length_s)
@@ -168,14 +168,14 @@ class Outcome:
 
 
 def flaws_of_log(name: str, log: bytes) -> list[str]:
-    """Lines that no program should write, and characters that no log should hold."""
+    """Return lines that no program should write, and characters that no log should contain."""
     lines = log.splitlines()
     found = [f"{name}: {line.decode(errors='replace')}" for line in lines if any(bad in line for bad in BAD_LINES)]
     return found + [f"{name}: control characters in {line!r}" for line in lines if _CONTROL_CHARACTERS.search(line)]
 
 
 def counted_for(attack: str, counted: dict[str, float]) -> str:
-    """What the honest programs counted of an attack."""
+    """Return what the honest programs counted of an attack."""
     parts = []
     for pattern in COUNTED.get(attack, ()):
         value = sum(value for series, value in counted.items() if pattern in _short(series))
@@ -184,14 +184,14 @@ def counted_for(attack: str, counted: dict[str, float]) -> str:
 
 
 def _short(series: str) -> str:
-    """`plr_x_total{reason="y"}` as `x y`, whatever the other labels."""
+    """Return `plr_x_total{reason="y"}` as `x y`, whatever the other labels."""
     name, _, labels = series.partition("/")[2].partition("{")
     reason = re.search(r'(?:reason|result|code|resource|outcome)="([^"]*)"', labels)
     return f"{name.removeprefix('plr_').removesuffix('_total')} {reason[1] if reason else ''}".strip()
 
 
 def tables(outcome: Outcome) -> list[Table]:
-    """Everything for people."""
+    """Return everything as tables."""
     return [_requests(outcome), _attacks(outcome), _refused(outcome), _processes(outcome)]
 
 
@@ -225,7 +225,7 @@ def _attacks(outcome: Outcome) -> Table:
 
 
 def refusals(outcome: Outcome) -> dict[str, float]:
-    """All that the honest counted as refused or dropped during the attack, over all of them."""
+    """Return everything that the honest programs together counted as refused or dropped during the attack."""
     sums: dict[str, float] = {}
     for series, value in outcome.counted.items():
         short = _short(series)
@@ -265,7 +265,7 @@ def _processes(outcome: Outcome) -> Table:
 
 
 def show(console: Console, outcome: Outcome) -> None:
-    """Tables and verdicts."""
+    """Show tables and verdicts."""
     for table in tables(outcome):
         console.print(rich_table(table))
     stolen = [load.stolen for load in outcome.loads]
@@ -281,7 +281,7 @@ def show(console: Console, outcome: Outcome) -> None:
 
 
 def write_json(path: Path, outcome: Outcome) -> None:
-    """Everything, for machines."""
+    """Write everything for programs to read."""
     clients = {}
     for workload, records in outcome.records.items():
         quiet, troubled = outcome.quiet(workload), outcome.troubled(workload)

@@ -1,4 +1,4 @@
-"""Who takes part: honest robots and clouds, the insiders, a third party that is in nobody's fleet.
+"""Sets up the participants: honest robots and clouds, the insiders, a third party that belongs to no fleet.
 
 robot, robot_2   wlan0, wwan0 behind NAT ──┐                ┌── cloud_a, cloud_b
                                            ├── internet ────┼── rogue_cloud
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 
 def name_of(host: str) -> str:
-    """A node's name, as its certificate has it."""
+    """Return a node's name as in its certificate."""
     return host.replace("_", "-")
 
 
@@ -36,8 +36,8 @@ STREAMS = "rogue_streams"
 HONEST = (*(f"{name}.sidecar" for name in (*ROBOTS, *CLOUDS)), "controlplane")
 INSIDERS = (f"{ROGUE_ROBOT}.sidecar", f"{ROGUE_CLOUD}.sidecar", STREAMS, f"{ROGUE_CLOUD}.echo")
 PROFILES = {name: LinkProfile(delay_ms=10, jitter_ms=3) for name in ("wlan0", "wwan0")}
-"""Alike: where the member cloud is slow, a request's other copy answers, over the other carrier. What that costs shall
-not be how much worse the carrier is."""
+"""Both carriers are alike: where the rogue cloud is slow, a request's other copy answers over the other carrier. A
+worse carrier must not add to that cost."""
 SERVICE = {"name": "/echo", "deadline_ms": 500, "lifetime_ms": 30_000, "idempotent": True}
 POLICY = {
     "calls": [
@@ -46,8 +46,8 @@ POLICY = {
     ],
     "offers": [{"clouds": "*", "services": "/echo"}],
 }
-"""The rogue cloud may offer what the honest ones offer, and the rogue robot may call it, but not waste itself on the
-rogue cloud."""
+"""The rogue cloud may offer what the honest ones offer. The rogue robot may call the service, but only at the honest
+clouds, so that it does not waste itself on the rogue one."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,7 +60,7 @@ class Workload:
 
     @property
     def title(self) -> str:
-        """For people."""
+        """Title for people."""
         return f"{name_of(self.robot)}, {self.size // 1000} kB at {self.rate_hz:g} Hz"
 
     @property
@@ -73,16 +73,16 @@ WORKLOADS = tuple(Workload(name, size, rate) for name in ROBOTS for size, rate i
 
 
 def make_lab(seed: int) -> Lab:
-    """The lab; the rogue robot stands among the clouds, as it has a public address."""
+    """Make the lab; the rogue robot is among the clouds, since it has a public address."""
     clouds: tuple[HostSpec, ...] = tuple(server(name) for name in (*CLOUDS, ROGUE_CLOUD, ROGUE_ROBOT, THIRD))
     return Lab(LabConfig(robots=tuple(robot(name) for name in ROBOTS), clouds=clouds), seed=seed)
 
 
 def yield_processors(part: Part) -> None:
-    """Let a program run only on processors that nobody else wants (SCHED_IDLE, sched(7)), as it is now and will be.
+    """Let a program's present and future threads run only on idle processors (SCHED_IDLE, sched(7)).
 
-    An insider attacks from a machine of its own. Here it shares two processors with those whom it attacks, and its
-    threads would take turns of theirs that no packet of it could take.
+    An insider attacks from a machine of its own. Here it shares two processors with its victims, and its threads would
+    take processor time from them that no packet of its could take.
     """
     pid = part.process.inner_pid
     assert pid is not None, part.name
@@ -103,7 +103,7 @@ class Stage:
         self._tap = Tap(third, third.interfaces[0])
 
     def start(self) -> None:
-        """Bring everything up, everybody honest."""
+        """Bring everything up, with all programs honest."""
         for name in ROBOTS:
             for interface, profile in PROFILES.items():
                 self._lab.link(interface, host=name).set(profile)
@@ -120,7 +120,7 @@ class Stage:
             interfaces=["eth0"],
             module="lab.attacker.insider",
         )
-        # Parts go by their hosts' names.
+        # Parts are named after their hosts.
         self.system.parts[f"{ROGUE_ROBOT}.sidecar"] = self.system.parts.pop(rogue.name)
         started = {name: self._start_robot(name) for name in ROBOTS}
         for part in started.values():
@@ -129,7 +129,7 @@ class Stage:
         self._start_streams()
 
     def give_processors_to_the_honest(self) -> None:
-        """Let the insiders have what the honest leave: apart from the network, nothing is shared then."""
+        """Leave the insiders only idle processor time: apart from the network, nothing is shared then."""
         for name in INSIDERS:
             yield_processors(self.system.parts[name])
 
@@ -157,42 +157,42 @@ class Stage:
         self.system.start_node(STREAMS, ROGUE_ROBOT, argv)
 
     def start_client(self, workload: Workload, length_s: float) -> Part:
-        """Let an honest robot call for so long."""
+        """Let an honest robot call for this long."""
         argv = ["-m", "lab.echo", "call", "--size", str(workload.size), "--rate", str(workload.rate_hz)]
         argv += ["--duration", str(length_s), "--deadline-ms", str(SERVICE["deadline_ms"]), "--queue-depth", "200"]
         argv += ["--grace-s", "40", "--json", str(self.result_file(workload))]
         return self.system.start_node(workload.part, workload.robot, argv)
 
     def result_file(self, workload: Workload) -> Path:
-        """Where a client leaves its records."""
+        """Return the file in which a client leaves its records."""
         return self.system.folder / f"{workload.part}.json"
 
     # -- the attack -----------------------------------------------------------------------------------------------
 
     def attack(self, cycle_s: float, only: tuple[str, ...]) -> None:
-        """Let the insiders begin."""
+        """Let the insiders begin their attacks."""
         orders = Orders(cycle_s, self._third_party, tuple(name_of(name) for name in (*ROBOTS, *CLOUDS)), only)
         for name in self._orders_files():
             orders.write(self._file(name, ORDERS))
 
     def leave_alone(self) -> None:
-        """Let them be honest again."""
+        """Make the insiders honest again."""
         for name in self._orders_files():
             self._file(name, ORDERS).unlink(missing_ok=True)
 
     def tallies(self) -> dict[str, dict[str, list[int]]]:
-        """By insider and attack: how often, messages, bytes."""
+        """Return runs, messages and bytes by insider and attack."""
         files = {name: self._file(name, TALLY) for name in self._orders_files()}
         return {name: read_json(file) for name, file in files.items() if file.exists()}
 
     def bytes_to_third_party(self) -> int:
-        """UDP payload that reached it from honest nodes since the last call."""
+        """Return the UDP payload that reached the third party from honest nodes since the last call."""
         return sum(
             len(one.payload) for one in self._tap.take() if not one.outgoing and one.source[0] not in self._insiders
         )
 
     def _orders_files(self) -> tuple[str, ...]:
-        # As `System` names the configurations.
+        # The names that `System` gives the configurations.
         return f"{name_of(ROGUE_ROBOT)}.sidecar", f"{ROGUE_CLOUD}.sidecar", STREAMS
 
     def _file(self, name: str, suffix: str) -> Path:
@@ -201,7 +201,7 @@ class Stage:
     # -- what the honest count ------------------------------------------------------------------------------------
 
     def counters(self) -> dict[str, float]:
-        """Everything that the honest programs count, summed over them: `host/series`."""
+        """Return every counter of the honest programs, by `host/series`."""
         found = {}
         for host in (*ROBOTS, *CLOUDS, "control"):
             port = CONTROL_METRICS_PORT if host == "control" else METRICS_PORT
