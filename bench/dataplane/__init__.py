@@ -1,4 +1,4 @@
-"""The data plane measured against its targets, beside what users would pick instead.
+"""Measures the data plane against its targets, beside the alternatives that users have.
 
 `make bench-dataplane` runs every section of `sections/` and writes bench/results/dataplane.json and dataplane.html.
 Each contender is a program of its own (`programs/`), driven over a pipe (`remote.py`), on this host or on a host of

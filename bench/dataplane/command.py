@@ -30,7 +30,7 @@ QUICK_REPEATS = 1
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Options of `python -m bench dataplane`."""
+    """Add the options of `python -m bench dataplane`."""
     names = [section.name for section in SECTIONS]
     parser.add_argument("--only", action="append", choices=names, help="measure this section only; may be repeated")
     parser.add_argument("--quick", action="store_true", help="few requests, one repeat: does it work, not how fast")
@@ -41,7 +41,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    """Measure; returns the exit code: 1 when a section failed or a measured target is missed."""
+    """Measure and return the exit code: 1 if a section failed or a measured target is missed."""
     console = Console(highlight=False)
     repeats = options.repeats or (QUICK_REPEATS if options.quick else DEFAULT_REPEATS)
     report = Report(machine(), options.quick, repeats)
@@ -55,7 +55,7 @@ def run(options: argparse.Namespace) -> int:
             context = Context(Path(folder), repeats, options.quick, status.update)
             try:
                 findings = section.measure(context)
-            except Exception as error:  # the other sections are worth having
+            except Exception as error:  # the other sections still count
                 traceback.print_exc()
                 failed = True
                 findings = Findings(notes=[f"failed: {error}"])

@@ -1,4 +1,4 @@
-"""Our data plane for a section: a robot's and some clouds' programs, introduced to each other and ready to call."""
+"""Starts our data plane for a section: programs of a robot and some clouds, introduced to each other, ready to call."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ SERVICE: Service = {"name": "/bench", "deadline_ms": 1_000.0, "lifetime_ms": 30_
 
 
 EVERY_CARRIER = [(carrier, CLOUD) for carrier in CARRIERS]
-"""A mapping that sends each request over all of them."""
+"""A mapping that sends each request over all carriers."""
 
 
 class Ours:
@@ -44,10 +44,10 @@ class Ours:
         rekey_after_s: int | None = None,
         before: Sequence[str] = (),
     ) -> None:
-        """Start them; hosts are the lab's, None is this machine. Without `mapping` the engine picks the paths.
+        """Start the programs; hosts are the lab's, None is this machine. Without `mapping` the engine picks the paths.
 
-        `null_cipher`: nothing is sealed. `rekey_after_s`: as in a sidecar's configuration. `before`: a command that
-        starts each program, chrt say.
+        With `null_cipher` nothing is sealed. `rekey_after_s` is that of a sidecar's configuration. `before` is a
+        command that starts each program, such as chrt.
         """
         self._stack = contextlib.ExitStack()
         start = self._stack.enter_context
@@ -88,7 +88,7 @@ class Ours:
         mapping: Sequence[tuple[str, str]] | None = EVERY_CARRIER,
         **more: Any,
     ) -> Self:
-        """Start them in a lab of `topology`, the robot with the carriers that it is mapped to; `more` as above."""
+        """Start them in a lab of `topology`, the robot with the carriers of its mapping; `more` as above."""
         carriers = CARRIERS if mapping is None else tuple(dict.fromkeys(carrier for carrier, _ in mapping))
         hosts = {cloud: lab.host(cloud) for cloud in clouds}
         more = {"interfaces": carriers, "cloud_interface": CLOUD_INTERFACE, **more}
@@ -112,18 +112,18 @@ class Ours:
         return self.finish()
 
     def begin(self, **plan: Any) -> None:
-        """Begin to send; `finish` returns what became of it."""
+        """Begin to send; `finish` returns the outcome."""
         self.robot.begin("call", **plan)
 
     def finish(self, timeout_s: float = 180.0) -> Calls:
-        """Wait for what was begun."""
+        """Wait for the outcome of what was begun."""
         return Calls.of(self.robot.finish(timeout_s))
 
     def take_one_way(self) -> list[float]:
-        """One-way seconds of the requests since the last time, over all clouds."""
+        """Return the one-way seconds of the requests since the last call, over all clouds."""
         return [seconds for cloud in self.clouds.values() for _, seconds in cloud.ask("take_one_way")]
 
     def sent_bytes(self) -> int:
-        """Bytes of UDP payload that the robot has sent so far, over all its interfaces."""
+        """Return the bytes of UDP payload that the robot has sent so far, over all its interfaces."""
         links = self.robot.ask("counters")["links"].values()
         return sum(int(link["bytes"].get("sent", 0)) for link in links)

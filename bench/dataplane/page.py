@@ -1,4 +1,4 @@
-"""The report as one HTML file: verdicts, then each section's tables and plots. Nothing is loaded from elsewhere."""
+"""Renders the report as one self-contained HTML file: verdicts, then each section's tables and plots."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 
 def render(report: Report) -> str:
-    """The whole page."""
+    """Return the whole page."""
     machine = ", ".join(f"{key}: {value}" for key, value in report.machine.items())
     how = "quick run, figures are worth little" if report.quick else f"{report.repeats} repeats"
     sections = "".join(_section(report.titles[name], findings) for name, findings in report.sections.items())

@@ -1,4 +1,4 @@
-"""Programs driven over their stdin and stdout: one JSON object a line, an answer for each question.
+"""Controls programs over their stdin and stdout: one JSON object a line, an answer for each question.
 
 The controller's side is `Remote`; the program's side is `serve`, given an object whose methods are the questions.
 A program ends when its stdin closes.
@@ -33,10 +33,10 @@ class RemoteError(RuntimeError):
 
 
 class Program(Protocol):
-    """What `serve` needs: besides `close`, every public method is a question that the controller may ask."""
+    """A program for `serve`: besides `close`, every public method is a question that the controller may ask."""
 
     def close(self) -> None:
-        """The controller is gone."""
+        """End, because the controller is gone."""
 
 
 class Remote:
@@ -61,7 +61,7 @@ class Remote:
     ) -> Remote:
         """Run `python -m bench.dataplane.programs.MODULE` on this host or on one of the lab; logs go to `folder`.
 
-        `environment` comes on top of what the program would have. `before`: a command that starts it.
+        `environment` is added to the program's environment. `before` is a command that starts it.
         """
         name = name or module
         argv = [*before, sys.executable, "-m", f"bench.dataplane.programs.{module}"]
@@ -82,12 +82,12 @@ class Remote:
         return cls(name, process, log)
 
     def ask(self, question: str, *, timeout_s: float = ANSWER_TIMEOUT_S, **fields: Any) -> Any:
-        """Ask and wait for the answer. Raises RemoteError."""
+        """Ask and wait for the answer; raises RemoteError."""
         self.begin(question, **fields)
         return self.finish(timeout_s)
 
     def begin(self, question: str, **fields: Any) -> None:
-        """Ask; `finish` brings the answer, meanwhile the program works. Raises RemoteError."""
+        """Ask; `finish` gets the answer, and the program works meanwhile. Raises RemoteError."""
         assert self._process.stdin is not None
         try:
             self._process.stdin.write(json.dumps({"question": question, **fields}).encode() + b"\n")
@@ -96,19 +96,19 @@ class Remote:
             raise RemoteError(f"{self.name}: {error}\n{self._last_words()}") from error
 
     def ready(self, timeout_s: float) -> bool:
-        """Whether the answer to what was begun comes, or the program ends, within this time."""
+        """Return whether the answer to what was begun comes, or the program ends, within this time."""
         assert self._process.stdout is not None
         return b"\n" in self._read or bool(select.select([self._process.stdout], [], [], max(0.0, timeout_s))[0])
 
     def finish(self, timeout_s: float = ANSWER_TIMEOUT_S) -> Any:
-        """Return the answer to what was begun. Raises RemoteError."""
+        """Return the answer to what was begun; raises RemoteError."""
         answer = json.loads(self._read_line(time.monotonic() + timeout_s))
         if "error" in answer:
             raise RemoteError(f"{self.name}: {answer['error']}")
         return answer["answer"]
 
     def close(self) -> None:
-        """End the program; harmless when repeated."""
+        """End the program; may be called again."""
         assert self._process.stdin is not None
         assert self._process.stdout is not None
         with contextlib.suppress(OSError):
@@ -149,7 +149,7 @@ class Remote:
 def serve(program: Program) -> None:
     """Answer the controller's questions until it closes the pipe."""
     out = os.fdopen(os.dup(1), "wb")
-    os.dup2(2, 1)  # what a library prints must not get between the answers
+    os.dup2(2, 1)  # output of a library must not mix with the answers
     try:
         for line in sys.stdin:
             fields = json.loads(line)

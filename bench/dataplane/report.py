@@ -1,4 +1,4 @@
-"""All that one run found, as the JSON file and the page have it."""
+"""Collects the findings of one run for the JSON file and the page."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 @dataclass(slots=True)
 class Report:
-    """All that one run found."""
+    """The findings of one run."""
 
     machine: dict[str, Any]
     quick: bool
@@ -28,7 +28,7 @@ class Report:
     seconds: dict[str, float] = field(default_factory=dict)
 
     def add(self, section: Section, findings: Findings, seconds: float) -> None:
-        """Take what a section found."""
+        """Add the findings of a section."""
         self.figures.update(findings.figures)
         self.intervals.update((key, found) for key, found in findings.intervals.items() if found is not None)
         self.sections[section.name] = findings
@@ -36,14 +36,14 @@ class Report:
         self.seconds[section.name] = round(seconds, 1)
 
     def ranges(self) -> dict[str, str]:
-        """The intervals for people, by the figure's name."""
+        """Return the intervals as text, by the figure's name."""
         return {
             key: f"{text_of(found.low)} to {text_of(found.high)}, {found.samples} samples"
             for key, found in self.intervals.items()
         }
 
     def as_json(self) -> dict[str, Any]:
-        """The figures by their names at the top; what stands behind them below."""
+        """Return the figures by name at the top, and their basis below."""
         return {
             **{target.key: None for target in TARGETS},
             **self.figures,

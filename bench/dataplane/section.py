@@ -1,4 +1,4 @@
-"""What a section gets and what it brings back."""
+"""Defines what a section receives and returns."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ class Context:
     """How thoroughly to measure, and where."""
 
     folder: Path
-    """For logs; gone after the run."""
+    """Folder for logs; gone after the run."""
     repeats: int
     quick: bool
     say: Callable[[str], None]
-    """Shows what is being measured right now."""
+    """Shows what is being measured."""
 
     def scaled(self, count: int, at_least: int = 1) -> int:
-        """A number of requests, or a fifth of it in a quick run."""
+        """Return a number of requests, or a fifth of it in a quick run."""
         return max(at_least, count // 5) if self.quick else count
 
 
@@ -50,7 +50,7 @@ class Findings:
 
     figures: dict[str, Figure] = field(default_factory=dict)
     intervals: dict[str, Interval | None] = field(default_factory=dict)
-    """By the figure's name, of those that are estimates."""
+    """Intervals of those figures that are estimates, by name."""
     tables: list[Table] = field(default_factory=list)
     plots: list[Plot] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
@@ -66,6 +66,6 @@ class Section:
 
 
 def table_of(title: str, rows: Sequence[Row]) -> Table:
-    """The usual table of runs of requests."""
+    """Return the usual table of runs of requests."""
     columns = ("", "requests", "lost", "P50 ms", "P99 ms", "worst ms")
     return Table(title, columns, tuple((r.name, r.sent, r.lost, r.p50_ms, r.p99_ms, r.max_ms) for r in rows))

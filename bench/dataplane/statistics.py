@@ -1,7 +1,7 @@
-"""From requests to figures: quantiles, medians of repeats, rows of a table. None stands for what was not measured.
+"""Derives figures from requests: quantiles, medians of repeats, rows of a table. None means not measured.
 
-A figure that is held against a target comes with an interval: how far it moves when the samples are drawn again from
-themselves (the bootstrap). It knows nothing of what differs from run to run.
+A figure compared with a target comes with an interval: how far it moves when the samples are resampled (the bootstrap).
+The interval does not cover differences from run to run.
 """
 
 from __future__ import annotations
@@ -18,16 +18,16 @@ if TYPE_CHECKING:
 
 MS = 1000.0
 DRAWS = 400
-"""How often samples are drawn again for an interval."""
+"""Number of resamplings for an interval."""
 CONFIDENCE = 0.95
 STRETCH = 5
 """Messages whose arrivals make one sample of goodput."""
 BLOCK = 10
-"""Requests in a row that are drawn together: what disturbs one often disturbs the next."""
+"""Consecutive requests drawn together: a disturbance of one often affects the next."""
 
 
 class Interval(NamedTuple):
-    """Where 95 % of the draws lie, and of how many samples they are."""
+    """The range that holds 95 % of the draws, and the number of samples."""
 
     low: float
     high: float
@@ -35,55 +35,55 @@ class Interval(NamedTuple):
 
 
 def quantile(values: Iterable[float], fraction: float) -> float | None:
-    """The smallest value that at least `fraction` of the values do not exceed; None of no values."""
+    """Return the smallest value that at least `fraction` of the values do not exceed; None if there are no values."""
     ordered = sorted(values)
     return ordered[max(0, math.ceil(fraction * len(ordered)) - 1)] if ordered else None
 
 
 def p99(values: Iterable[float]) -> float | None:
-    """The 99th percentile; None of no values."""
+    """Return the 99th percentile; None if there are no values."""
     return quantile(values, 0.99)
 
 
 def p99_ratio(samples: Sequence[float], others: Sequence[float]) -> float | None:
-    """The P99 of the one over that of the others."""
+    """Return the P99 of the samples over that of the others."""
     return ratio(p99(samples), p99(others))
 
 
 def median_ratio(samples: Sequence[float], others: Sequence[float]) -> float | None:
-    """The median of the one over that of the others."""
+    """Return the median of the samples over that of the others."""
     return ratio(median(samples), median(others))
 
 
 def median(values: Iterable[float | None]) -> float | None:
-    """Median of what was measured; None when nothing was."""
+    """Return the median of what was measured; None if nothing was."""
     known = [value for value in values if value is not None]
     return statistics.median(known) if known else None
 
 
 def geometric_mean(values: Iterable[float | None]) -> float | None:
-    """Geometric mean of what was measured; None when nothing was, or something is not above zero."""
+    """Return the geometric mean of what was measured; None if nothing was, or a value is not above zero."""
     known = [value for value in values if value is not None]
     return statistics.geometric_mean(known) if known and min(known) > 0 else None
 
 
 def ratio(one: float | None, other: float | None) -> float | None:
-    """`one` over `other`; None unless both were measured and `other` is above zero."""
+    """Return `one` over `other`; None unless both were measured and `other` is above zero."""
     return one / other if one is not None and other else None
 
 
 def difference(one: float | None, other: float | None) -> float | None:
-    """`one` minus `other`; None unless both were measured."""
+    """Return `one` minus `other`; None unless both were measured."""
     return one - other if one is not None and other is not None else None
 
 
 def worst(values: Iterable[float | None]) -> float | None:
-    """Largest of what was measured; None when nothing was."""
+    """Return the largest of what was measured; None if nothing was."""
     return max((value for value in values if value is not None), default=None)
 
 
 def goodput_of_stretches(calls: Calls, message_bytes: int) -> list[float]:
-    """Mbit/s of each stretch of STRETCH messages that arrived one after the other."""
+    """Return the Mbit/s of each stretch of STRETCH messages that arrived one after the other."""
     ends = sorted(calls.arrivals())[::STRETCH]
     return [STRETCH * message_bytes * 8 / 1e6 / max(end - start, 1e-9) for start, end in itertools.pairwise(ends)]
 
@@ -91,10 +91,10 @@ def goodput_of_stretches(calls: Calls, message_bytes: int) -> list[float]:
 def interval(
     of: Callable[..., float | None], *sets: Sequence[float], block: int = BLOCK, seed: int = 1
 ) -> Interval | None:
-    """How far `of(*sets)` moves when each set is drawn again from itself, `block` samples in a row at a time.
+    """Return how far `of(*sets)` moves when each set is resampled, `block` consecutive samples at a time.
 
-    None when there are fewer than two samples in a set, or a draw gives no figure. `samples` is the smallest set's.
-    Blocks are a quarter of a small set at most: drawn as a whole it would never differ from itself.
+    Returns None if a set has fewer than two samples, or a draw gives no figure. `samples` is that of the smallest set.
+    Blocks are at most a quarter of a small set: drawn as a whole it would never differ from itself.
     """
     smallest = min(map(len, sets), default=0)
     if smallest < 2:
@@ -112,7 +112,7 @@ def interval(
 
 
 def _drawn_again(samples: Sequence[float], block: int, rng: random.Random) -> list[float]:
-    """As many samples, in blocks that begin anywhere; the first follows the last."""
+    """Return as many samples, in blocks that begin anywhere; the first sample follows the last."""
     count = len(samples)
     drawn: list[float] = []
     while len(drawn) < count:
@@ -126,9 +126,9 @@ class Calls:
     """A run of requests in order of sending."""
 
     sent_s: tuple[float, ...]
-    """CLOCK_MONOTONIC."""
+    """Times of sending, CLOCK_MONOTONIC."""
     latency_s: tuple[float | None, ...]
-    """None: no answer came."""
+    """Latencies; None if no answer came."""
 
     @classmethod
     def of(cls, fields: dict[str, Any]) -> Self:
@@ -136,16 +136,16 @@ class Calls:
         return cls(tuple(fields["sent_s"]), tuple(fields["latency_s"]))
 
     def between(self, start_s: float, end_s: float = math.inf) -> Calls:
-        """Only those sent in this stretch."""
+        """Return only the requests sent in this period."""
         kept = [pair for pair in zip(self.sent_s, self.latency_s, strict=True) if start_s <= pair[0] < end_s]
         return Calls(tuple(sent for sent, _ in kept), tuple(latency for _, latency in kept))
 
     def arrivals(self) -> list[float]:
-        """When the answers came."""
+        """Return when the answers came."""
         return [sent + latency for sent, latency in self._answered()]
 
     def line(self, zero_s: float) -> list[tuple[float, float]]:
-        """For a plot: seconds after `zero_s` and latency in milliseconds of each answered request."""
+        """Return for a plot the seconds after `zero_s` and the latency in milliseconds of each answered request."""
         return [(sent - zero_s, latency * MS) for sent, latency in self._answered()]
 
     def _answered(self) -> list[tuple[float, float]]:
@@ -153,16 +153,16 @@ class Calls:
         return [(sent, latency) for sent, latency in pairs if latency is not None]
 
     def duration_s(self) -> float | None:
-        """From the first request's departure to the last answer's arrival."""
+        """Return the time from the first request's departure to the last answer's arrival."""
         ends = self.arrivals()
         return max(ends) - self.sent_s[0] if ends else None
 
     def answered_ms(self) -> list[float]:
-        """The latencies of those that were answered, in order of sending, milliseconds."""
+        """Return the latencies of answered requests in milliseconds, in order of sending."""
         return [latency * MS for _, latency in self._answered()]
 
     def row(self, name: str) -> Row:
-        """Summarise; quantiles are over the answered ones."""
+        """Summarise the run; quantiles are over answered requests."""
         answered = self.answered_ms()
         return Row(
             name,
@@ -187,7 +187,7 @@ class Row:
 
     @classmethod
     def of_repeats(cls, rows: Sequence[Row]) -> Row:
-        """Medians of the quantiles, the sums of requests and losses, the worst of all."""
+        """Return the medians of the quantiles, the sums of requests and losses, and the worst of all."""
         return cls(
             rows[0].name,
             sent=sum(row.sent for row in rows),

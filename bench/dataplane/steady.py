@@ -1,4 +1,4 @@
-"""What else the machine does, and how it sleeps, kept out of figures in milliseconds: for all contenders alike."""
+"""Keeps the machine's other work and its sleep out of figures in milliseconds, for all contenders alike."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _REALTIME = ("chrt", "--rr", "1")
 
 @lru_cache(maxsize=1)
 def realtime() -> tuple[str, ...]:
-    """The command that starts a program as `deploy/systemd/realtime.conf` does; nothing where that is not allowed."""
+    """Return the command that starts a program as `deploy/systemd/realtime.conf` does; empty if that is not allowed."""
     try:
         allowed = subprocess.run([*_REALTIME, "true"], check=False, capture_output=True).returncode == 0
     except OSError:
@@ -28,7 +28,7 @@ def realtime() -> tuple[str, ...]:
 
 @contextlib.contextmanager
 def awake() -> Iterator[bool]:
-    """Keep the processors from sleeping deeply, as cyclictest does; gives whether the kernel lets us.
+    """Keep the processors from sleeping deeply, as cyclictest does; yield whether the kernel lets us.
 
     Waking from sleep costs a physical machine some ten microseconds, a nested virtual one some hundred.
     """

@@ -1,11 +1,11 @@
-"""What the data plane's figures are held against."""
+"""Defines the targets of the data plane's figures."""
 
 from __future__ import annotations
 
 from bench.reporting.targets import Target
 
 RTT_MS = 50.0
-"""Round trip of the links of the section `loss`."""
+"""Round trip of the links in the section `loss`."""
 
 TARGETS = (
     Target("engine_150k_over_aioquic", "one-way time of 150 kB on loopback, ours over aioquic's", at_most=0.25),

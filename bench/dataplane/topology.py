@@ -1,4 +1,4 @@
-"""The labs of the sections: a robot with two carriers and a server, over plain kernel cables or emulated links."""
+"""Makes the sections' labs: a robot with two carriers and a server, over plain kernel cables or emulated links."""
 
 from __future__ import annotations
 
@@ -20,16 +20,16 @@ _TABLE = "inet cut"
 
 
 def cables() -> LabConfig:
-    """Nothing but the kernel between the hosts: veth pairs and a forwarding namespace.
+    """Return a lab with nothing but the kernel between the hosts: veth pairs and a forwarding namespace.
 
-    An emulator would add its own wake-ups, more than a call through us costs. No NAT, and routes by source address:
-    kernel multipath TCP, whose sockets are bound to addresses, needs both.
+    An emulator would add its own wake-ups, more than a call through us costs. There is no NAT, and routes go by source
+    address: kernel multipath TCP, whose sockets are bound to addresses, needs both.
     """
     return _lab(tuple(InterfaceSpec(name, emulated=False, nat=None) for name in CARRIERS))
 
 
 def emulated(*profiles: LinkProfile) -> LabConfig:
-    """Carriers with a delay, a rate or losses: one for each profile, which holds for both directions."""
+    """Return a lab with a carrier for each profile of delay, rate or losses, which holds for both directions."""
     return _lab(
         tuple(
             InterfaceSpec(name, nat=None, up=profile, down=profile)
@@ -39,7 +39,7 @@ def emulated(*profiles: LinkProfile) -> LabConfig:
 
 
 def ethernet_loopback(lab: Lab) -> Host:
-    """Return a host whose loopback carries no longer packets than Ethernet: what its speed is worth on real networks.
+    """Return a host whose loopback packets are no longer than Ethernet's, so that its speed applies to real networks.
 
     Raises LabError.
     """
@@ -55,7 +55,7 @@ def _lab(interfaces: tuple[InterfaceSpec, ...]) -> LabConfig:
 
 
 def allow_multipath(robot: Host, cloud: Host) -> None:
-    """Let the kernel's multipath TCP use the robot's second carrier too. Raises CalledProcessError: it has none."""
+    """Let the kernel's multipath TCP use the robot's second carrier; raises CalledProcessError if it has none."""
     for host in (robot, cloud):
         host.run(["ip", "mptcp", "limits", "set", "subflow", "2", "add_addr_accepted", "2"], check=True)
     robot.run(["ip", "mptcp", "endpoint", "flush"], check=True)
@@ -64,14 +64,14 @@ def allow_multipath(robot: Host, cloud: Host) -> None:
 
 
 class SilentCut:
-    """Takes away cables in the middle: everything is lost both ways, while the carriers stay up and nobody is told."""
+    """Cuts cables in the middle: everything is lost both ways, while the carriers stay up and nobody is notified."""
 
     def __init__(self, lab: Lab) -> None:
         self._core = lab.host(_CORE)
         self._lab = lab
 
     def cut(self, *interfaces: str) -> None:
-        """Lose all from and to these interfaces of the robot. Raises LabError."""
+        """Lose all traffic from and to these interfaces of the robot; raises LabError."""
         ports = ", ".join(f'"to{self._number(name)}"' for name in interfaces)
         self._nft(
             f"table {_TABLE} {{\n"
@@ -81,11 +81,11 @@ class SilentCut:
         )
 
     def mend(self) -> None:
-        """End the cut. Raises LabError."""
+        """End the cut; raises LabError."""
         self._nft(f"delete table {_TABLE}")
 
     def _number(self, interface: str) -> int:
-        """The number that the lab gives an interface: the third byte of its network."""
+        """Return the number that the lab gives an interface: the third byte of its network."""
         return int(self._lab.host(ROBOT).address(interface).split(".")[2])
 
     def _nft(self, rules: str) -> None:

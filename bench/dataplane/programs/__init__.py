@@ -1,1 +1,1 @@
-"""The contenders, each a program that `bench.dataplane.remote` starts and drives."""
+"""The contenders, each a program that `bench.dataplane.remote` starts and controls."""

@@ -1,7 +1,7 @@
-"""Our data plane as a program: engine, interface threads and sockets of a sidecar, without ROS and control plane.
+"""Runs our data plane as a program: a sidecar's engine, interface threads and sockets, without ROS and control plane.
 
-The application is this very process: the robot's side sends the requests of a plan, the cloud's answers each with its
-beginning. What the control plane would push (peers, mapping) comes from the controller.
+This process itself is the application: the robot's side sends the requests of a plan, the cloud's side answers each
+with its beginning. The controller supplies what the control plane would push (peers, mapping).
 """
 
 from __future__ import annotations
@@ -62,7 +62,7 @@ class EngineProgram:
     def start(
         self, config: dict[str, Any], answer_bytes: int = HEADER.size, *, null_cipher: bool = False
     ) -> dict[str, Any]:
-        """Open the interfaces of a sidecar's configuration; returns it as a peer, for the other side's `meet`."""
+        """Open the interfaces of a sidecar's configuration; return it as a peer, for the other side's `meet`."""
         if null_cipher:
             install()
         parsed = SidecarConfig.model_validate(
@@ -108,21 +108,21 @@ class EngineProgram:
         self._plane.set_carried({SERVICE: None})
 
     def call(self, **plan: Any) -> dict[str, Any]:
-        """Robot: send the requests of a plan; returns its log."""
+        """Robot: send the requests of a plan and return the log."""
         self._failed = []
         return {**self._caller.call(Plan(**plan)), "failed": self._failed}
 
     def take_one_way(self) -> list[tuple[int, float]]:
-        """Cloud: number and one-way seconds of every request since the last time."""
+        """Cloud: return number and one-way seconds of every request since the last call."""
         taken, self._one_way = self._one_way, []
         return taken
 
     def usage(self) -> dict[str, Any]:
-        """Processor seconds, peak of resident bytes, threads."""
+        """Return processor seconds, peak of resident bytes, threads."""
         return {**usage(), "threads": threading.active_count()}
 
     def counters(self) -> dict[str, Any]:
-        """What the data plane counted."""
+        """Return what the data plane counted."""
         engine = self._plane.engine_stats
         links = {}
         for link in self._plane.link_stats():
@@ -191,7 +191,7 @@ def described(credential: SessionCredential, token: bytes, candidates: Sequence[
 
 
 def peer_of(fields: dict[str, Any], receiver: SessionCredential) -> Peer:
-    """Return the peer that was `described`, as the control plane tells this one of it."""
+    """Return the peer that was `described`, as the control plane would send it."""
     role = Role(fields["role"])
     candidates = tuple(
         Candidate(c["interface_id"], c["interface"], CandidateKind(c["kind"]), (c["address"][0], c["address"][1]))

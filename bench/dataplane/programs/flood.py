@@ -1,4 +1,4 @@
-"""The attacker as a program: floods a port with junk, from as many ports of its own as wanted."""
+"""Runs the attacker as a program: floods a port with junk, from any number of its own ports."""
 
 from __future__ import annotations
 
@@ -17,19 +17,19 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
 
 POOL = 4096
-"""Different datagrams of a flood, sent over and over."""
+"""Different datagrams of a flood, sent repeatedly."""
 SOURCES = 16
 ROUND = 20_000
-"""Datagrams of a fuzzer that are made before they are sent."""
+"""Datagrams that a fuzzer makes before it sends them."""
 
 
 class FloodProgram:
-    """One attacker, who knows some real datagrams (`seen`, in base64)."""
+    """One attacker that knows some real datagrams (`seen`, in base64)."""
 
     def flood(
         self, address: str, port: int, kind: str, seen: list[str], rate_hz: float, seconds: float
     ) -> dict[str, Any]:
-        """Flood an address with junk of a kind; returns how much it sent and what that cost."""
+        """Flood an address with junk of a kind; return how much was sent and what that cost."""
         pool = make_junk(JunkKind(kind), _decoded(seen), POOL, random.Random(1))
         with _sockets(address, port) as sockets:
             cpu = time.process_time()
@@ -37,7 +37,7 @@ class FloodProgram:
             return {"sent": sent, "cpu_s": time.process_time() - cpu}
 
     def fuzz(self, address: str, port: int, seen: list[str], rate_hz: float, count: int, seed: int) -> int:
-        """Send junk of all kinds, each datagram another one; returns how many there were."""
+        """Send junk of all kinds, each datagram different; return how many there were."""
         rng = random.Random(seed)
         known = _decoded(seen)
         sent = 0
@@ -50,7 +50,7 @@ class FloodProgram:
         return sent
 
     def close(self) -> None:
-        """Nothing to end."""
+        """Do nothing: there is nothing to end."""
 
 
 def _decoded(seen: list[str]) -> list[bytes]:
@@ -59,7 +59,7 @@ def _decoded(seen: list[str]) -> list[bytes]:
 
 @contextlib.contextmanager
 def _sockets(address: str, port: int) -> Iterator[list[socket.socket]]:
-    """Sockets of different ports of ours, connected."""
+    """Yield connected sockets with different local ports."""
     family = socket.AF_INET6 if ":" in address else socket.AF_INET
     with contextlib.ExitStack() as stack:
         sockets = [stack.enter_context(socket.socket(family, socket.SOCK_DGRAM)) for _ in range(SOURCES)]

@@ -1,4 +1,4 @@
-"""aioquic: a live connection, a stream for each message; over UDP sockets, or in memory without any."""
+"""Runs aioquic: a live connection with a stream for each message, over UDP sockets, or in memory without any."""
 
 from __future__ import annotations
 
@@ -31,13 +31,13 @@ _T = TypeVar("_T")
 
 START_TIMEOUT_S = 10.0
 _WINDOW_BYTES = 64 << 20
-"""Flow control out of the way: what is measured is the protocol's cost, not its default buffer."""
+"""Window that keeps flow control out of the way: the protocol's cost is measured, not its default buffer."""
 _ALPN = ["bench"]
 _MEMORY_ADDRESS = ("192.0.2.1", 1)
 
 
 class QuicProgram:
-    """Client or server, by which of `listen` and `connect` is asked first."""
+    """A client or server, depending on whether `listen` or `connect` comes first."""
 
     def __init__(self) -> None:
         self._loop = asyncio.new_event_loop()
@@ -46,7 +46,7 @@ class QuicProgram:
         self._connection: _Peer | None = None
 
     def listen(self, answer_bytes: int = HEADER.size) -> int:
-        """Serve on a free UDP port of loopback; returns it."""
+        """Serve on a free UDP port of loopback, and return it."""
 
         def make(*arguments: Any, **options: Any) -> _Peer:
             return _Peer(self._on_request, *arguments, answer_bytes=answer_bytes, **options)
@@ -78,16 +78,16 @@ class QuicProgram:
         return self._caller.call(Plan(**plan))
 
     def take_one_way(self) -> list[tuple[int, float]]:
-        """Number and one-way seconds of every request since the last time."""
+        """Return number and one-way seconds of every request since the last call."""
         taken, self._one_way = self._one_way, []
         return taken
 
     def usage(self) -> dict[str, float]:
-        """Processor seconds and peak of resident bytes."""
+        """Return processor seconds and peak of resident bytes."""
         return usage()
 
     def in_memory(self, size: int, count: int) -> list[float]:
-        """Seconds for each of `count` messages between two connections of this process, without sockets."""
+        """Return the seconds for each of `count` messages between two connections of this process, without sockets."""
         client, server = _joined()
         payload = os.urandom(size)
         return [_deliver(client, server, payload) for _ in range(count)]
@@ -109,7 +109,7 @@ class QuicProgram:
 
 
 class _Peer(QuicConnectionProtocol):
-    """Collects streams; hands each whole message's header on, and answers it when `answer_bytes` says so."""
+    """Collects streams; passes on each whole message's header, and answers it if `answer_bytes` says so."""
 
     def __init__(
         self, on_message: Callable[[bytes, float], None], *arguments: Any, answer_bytes: int | None, **options: Any
@@ -197,7 +197,7 @@ def _deliver(sender: QuicConnection, receiver: QuicConnection, payload: bytes) -
                 _transfer(receiver, sender)
                 return took
         if not moved + _transfer(receiver, sender):
-            for side in (sender, receiver):  # only a timer, such as the pacer's or a delayed ack's, goes on
+            for side in (sender, receiver):  # only a timer, such as the pacer's or a delayed ack's, makes progress
                 side.handle_timer(now=max(time.monotonic(), side.get_timer() or 0.0))
 
 

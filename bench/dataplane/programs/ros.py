@@ -1,4 +1,4 @@
-"""ROS 2, unmodified: an rclpy client that calls the echo service (`lab.echo`) of whatever serves it."""
+"""Runs unmodified ROS 2: an rclpy client that calls the echo service (`lab.echo`) of any server."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class RosProgram:
         threading.Thread(target=self._executor.spin, daemon=True).start()
 
     def connect(self, answer_bytes: int, compute_s: float) -> None:
-        """Wait for a server; each request asks it for so long an answer, after so long a time."""
+        """Wait for a server; each request asks it for an answer of this length after this time."""
         self._format = f"{compute_s * 1e3:g} {answer_bytes}"
         if not self._client.wait_for_service(timeout_sec=SERVER_TIMEOUT_S):
             raise TimeoutError(f"no server of {SERVICE}")
@@ -42,7 +42,7 @@ class RosProgram:
         return self._caller.call(Plan(**plan))
 
     def usage(self) -> dict[str, float]:
-        """Processor seconds and peak of resident bytes."""
+        """Return processor seconds and peak of resident bytes."""
         return usage()
 
     def close(self) -> None:

@@ -19,7 +19,7 @@ CHECK_PERIOD_S = 0.05
 
 
 def main() -> None:
-    """Entry point."""
+    """Run the command line."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--size", type=int, default=1000, help="bytes of each request (default %(default)s)")
     parser.add_argument("--at-once", type=int, default=16, help="calls in flight (default %(default)s)")

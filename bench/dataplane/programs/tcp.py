@@ -1,4 +1,4 @@
-"""One TCP connection, or one multipath TCP connection of the kernel: messages with a length before them."""
+"""Runs one TCP connection, or one multipath TCP connection of the kernel, with length-prefixed messages."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _MPTCP_INFO = 1
 
 
 class TcpProgram:
-    """Client or server, by which of `listen` and `connect` is asked first."""
+    """A client or server, depending on whether `listen` or `connect` comes first."""
 
     def __init__(self) -> None:
         self._connection: socket.socket | None = None
@@ -34,7 +34,7 @@ class TcpProgram:
         self._compute = Compute()
 
     def listen(self, *, multipath: bool, answer_bytes: int = HEADER.size, compute: dict[str, Any] | None = None) -> int:
-        """Serve on a free port of all addresses, as `compute` (the arguments of `Compute`) says; returns the port."""
+        """Serve on a free port of all addresses, as `compute` (arguments of `Compute`) says, and return the port."""
         self._answer_bytes = answer_bytes
         self._compute = Compute(**(compute or {}))
         listener = socket.socket(socket.AF_INET, socket.SOCK_STREAM, _IPPROTO_MPTCP if multipath else 0)
@@ -53,7 +53,7 @@ class TcpProgram:
         self._start(sock, lambda _sock, message, now: self._caller.answered(message, now))
 
     def subflows(self) -> int:
-        """How many paths the kernel's multipath TCP uses beside the first; raises OSError where it fell back to TCP."""
+        """Return how many paths multipath TCP uses besides the first; raises OSError if it fell back to TCP."""
         assert self._connection is not None
         return self._connection.getsockopt(_SOL_MPTCP, _MPTCP_INFO, 128)[0]
 
@@ -62,7 +62,7 @@ class TcpProgram:
         return self._caller.call(Plan(**plan))
 
     def usage(self) -> dict[str, float]:
-        """Processor seconds and peak of resident bytes."""
+        """Return processor seconds and peak of resident bytes."""
         return usage()
 
     def close(self) -> None:
@@ -81,7 +81,7 @@ class TcpProgram:
 
     def _send(self, _number: int, data: bytes) -> None:
         assert self._connection is not None
-        with contextlib.suppress(OSError):  # the kernel gave the connection up: what follows is lost
+        with contextlib.suppress(OSError):  # the kernel gave up the connection: everything that follows is lost
             self._connection.sendall(_LENGTH.pack(len(data)) + data)
 
     @staticmethod

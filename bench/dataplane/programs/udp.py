@@ -1,4 +1,4 @@
-"""Plain UDP: a message in datagrams of 1200 bytes, sent on every given path, nothing repeated, nothing paced.
+"""Runs plain UDP: a message in datagrams of 1200 bytes goes over every given path, without repetition or pacing.
 
 datagram   number u64, total u32, offset u32, bytes of the message from the offset on
 """
@@ -28,7 +28,7 @@ _MAX_INCOMPLETE = 1024
 
 
 class UdpProgram:
-    """Client or server, by which of `listen` and `connect` is asked first."""
+    """A client or server, depending on whether `listen` or `connect` comes first."""
 
     def __init__(self) -> None:
         self._selector = selectors.DefaultSelector()
@@ -38,7 +38,7 @@ class UdpProgram:
         self._one_way: list[tuple[int, float]] = []
 
     def listen(self, answer_bytes: int = HEADER.size) -> int:
-        """Serve on a free port of all addresses; returns it."""
+        """Serve on a free port of all addresses, and return it."""
         self._answer_bytes = answer_bytes
         sock = self._open(None)
         sock.bind(("0.0.0.0", 0))
@@ -46,7 +46,7 @@ class UdpProgram:
         return int(sock.getsockname()[1])
 
     def connect(self, paths: list[tuple[str | None, str, int]]) -> None:
-        """Use these paths: interface to bind to (None: the route decides), server's address and port."""
+        """Use these paths: interface to bind to (None lets the route decide), server's address and port."""
         self._paths = [(self._open(device), (host, port)) for device, host, port in paths]
         self._run(self._on_answer)
 
@@ -55,12 +55,12 @@ class UdpProgram:
         return self._caller.call(Plan(**plan))
 
     def take_one_way(self) -> list[tuple[int, float]]:
-        """Number and one-way seconds of every request since the last time."""
+        """Return number and one-way seconds of every request since the last call."""
         taken, self._one_way = self._one_way, []
         return taken
 
     def usage(self) -> dict[str, float]:
-        """Processor seconds and peak of resident bytes."""
+        """Return processor seconds and peak of resident bytes."""
         return usage()
 
     def close(self) -> None:

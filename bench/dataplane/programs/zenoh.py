@@ -1,4 +1,4 @@
-"""zenoh: a queryable, and queries to it over one session with several links, or over a session for each link."""
+"""Runs zenoh: a queryable, and queries to it over one session with several links, or one session for each link."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ LINKS_TIMEOUT_S = 10.0
 
 
 class ZenohProgram:
-    """Client or server, by which of `listen` and `connect` is asked first."""
+    """A client or server, depending on whether `listen` or `connect` comes first."""
 
     def __init__(self) -> None:
         self._sessions: list[zenoh.Session] = []
@@ -47,9 +47,9 @@ class ZenohProgram:
             self._sessions.append(session)
 
     def connect(self, sessions: list[list[str]], max_links: int, lease_ms: int, *, drop: bool = False) -> None:
-        """Open a session for each list of endpoints; returns when each has all its links.
+        """Open a session for each list of endpoints; return once each has all its links.
 
-        `drop`: a query that finds its session's queue full is dropped; else, as by default, it waits there.
+        With `drop`, a query that finds its session's queue full is dropped; by default it waits there.
         """
         if drop:
             self._when_full = zenoh.CongestionControl.DROP
@@ -68,11 +68,11 @@ class ZenohProgram:
         return self._caller.call(Plan(**plan))
 
     def usage(self) -> dict[str, float]:
-        """Processor seconds and peak of resident bytes."""
+        """Return processor seconds and peak of resident bytes."""
         return usage()
 
     def close(self) -> None:
-        """End; a session whose link is dead would close for seconds, so on threads that nobody waits for."""
+        """End on threads that nobody waits for: a session whose link is dead takes seconds to close."""
         for session in self._sessions:
             threading.Thread(target=session.close, daemon=True).start()
 

@@ -1,4 +1,4 @@
-"""What is measured: a module for each section, each with a `measure(context)`."""
+"""The sections, one module each with a `measure(context)`."""
 
 from __future__ import annotations
 
@@ -29,4 +29,4 @@ SECTIONS = (
     flood.SECTION,
     keys.SECTION,
 )
-"""In the order in which they run."""
+"""The sections in the order in which they run."""

@@ -1,12 +1,12 @@
-"""One of two paths goes silent while its interface stays up: what becomes of the requests that follow.
+"""Measures what becomes of requests after one of two paths goes silent while its interface stays up.
 
-50 requests a second of 1 kB, answers of 1 kB, over plain kernel cables. The path that carried more of the warm-up is
-the one that is cut, in the middle of the network, both ways: for whoever uses one path at a time, that is the one in
+50 requests a second of 1 kB, with answers of 1 kB, go over plain kernel cables. The path that carried more of the
+warm-up is cut in the middle of the network, both ways: for a contender that uses one path at a time, that is the one in
 use. The clients are bare programs, ours a sidecar's engine with the application in its process; every server answers
 on the thread that received the request.
 
 Ours and plain UDP run once more with real-time priority on processors that do not sleep (`_steady_`): the difference is
-what the machine's other business and its sleep cost.
+the cost of the machine's other work and its sleep.
 """
 
 from __future__ import annotations
@@ -38,10 +38,10 @@ BEFORE = 75
 AFTER = 410
 """Requests after it, at least."""
 GRACE_S = 3.0
-"""How long the last answers are waited for."""
+"""Longest wait for the last answers."""
 ZENOH_PORTS = (7447, 7448)
 ZENOH_LEASE_MS = 1_000
-"""Its default is 10 s; with it, nothing is answered before a run ends."""
+"""Zenoh's default is 10 s; with it, nothing is answered before a run ends."""
 NAMES = {
     "blackhole": "ours",
     "blackhole_steady": "ours, steady",
@@ -82,7 +82,7 @@ def measure(context: Context) -> Findings:
                 try:
                     with start(world) as client:
                         runs.setdefault(key, []).append(_run(world, client))
-                except Exception as error:  # a kernel without MPTCP, say: the others go on
+                except Exception as error:  # such as a kernel without MPTCP: the others go on
                     notes.append(f"{NAMES[key]}, repeat {repeat + 1}: {error}".splitlines()[0])
     rows = {key: [calls.between(cut).row(NAMES[key]) for calls, cut in repeats] for key, repeats in runs.items()}
     figures = _figures(rows)
@@ -124,7 +124,7 @@ def _figures(rows: dict[str, list[Row]]) -> dict[str, Figure]:
 
 
 def _run(world: World, client: Remote) -> tuple[Calls, float]:
-    """Warm up, cut the busier path in the middle of a run; returns the run and the moment of the cut."""
+    """Warm up, cut the busier path in the middle of a run; return the run and the time of the cut."""
     before = _sent_bytes(world.robot)
     client.ask("call", size=SIZE, count=BEFORE // 2, rate_hz=RATE_HZ, grace_s=GRACE_S)
     after = _sent_bytes(world.robot)
@@ -142,7 +142,7 @@ def _run(world: World, client: Remote) -> tuple[Calls, float]:
 
 
 def _sent_bytes(host: Host) -> dict[str, int]:
-    """Bytes that left by each interface so far."""
+    """Return the bytes that left by each interface so far."""
     found = {}
     for line in host.run(["cat", "/proc/net/dev"], check=True).stdout.splitlines():
         name, colon, counters = line.partition(":")
@@ -170,7 +170,7 @@ def _udp(world: World) -> Iterator[Remote]:
 
 @contextlib.contextmanager
 def _steady(start: Callable[[World], contextlib.AbstractContextManager[Remote]], world: World) -> Iterator[Remote]:
-    """The same undisturbed, as far as the kernel lets us. Raises RuntimeError where it does not."""
+    """Yield the same contender, undisturbed if the kernel lets us; raises RuntimeError if it does not."""
     with awake() as kept_awake:
         if not kept_awake or not realtime():
             raise RuntimeError("no real-time priority, or no say in how processors sleep")

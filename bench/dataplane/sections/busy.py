@@ -1,7 +1,7 @@
-"""The robot's and the cloud's processors are busy with other programs: what becomes of small requests.
+"""Measures small requests while the processors of robot and cloud are busy with other programs.
 
-50 requests a second of 1 kB over two plain cables, beside as many computing programs as there are processors. Once as
-any program is scheduled, once with the real-time priority that `deploy/systemd/realtime.conf` gives the sidecar.
+50 requests a second of 1 kB go over two plain cables, beside as many computing programs as there are processors: once
+with normal scheduling, once with the real-time priority that `deploy/systemd/realtime.conf` gives the sidecar.
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ def measure(context: Context) -> Findings:
 
 @contextlib.contextmanager
 def _computing() -> Iterator[None]:
-    """As many programs that never pause as there are processors."""
+    """Run as many programs that never pause as there are processors."""
     programs = [subprocess.Popen([sys.executable, "-c", "while True: pass"]) for _ in range(os.cpu_count() or 1)]
     try:
         yield

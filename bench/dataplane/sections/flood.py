@@ -1,7 +1,7 @@
-"""A stranger floods the port of a sidecar with junk while requests go on: none may be lost, and none be late by much.
+"""Lets a stranger flood the port of a sidecar with junk during requests: none may be lost, or be late by much.
 
-The junk is noise, and what a listener on the way can make of real datagrams. It leaves and arrives one by one: a run
-that the kernel joins would be cheaper for us than a stranger's is.
+The junk is noise, and what a listener on the path can make of real datagrams. It leaves and arrives one by one: a run
+that the kernel joins would be cheaper for us than a stranger's flood.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ COUNT = 300
 WARM_UP = 50
 SETTLE_S = 0.3
 ALLOWED_MS = 5.0
-"""By so much the P99 may rise, or to twice what it was."""
+"""How much the P99 may rise; it may also double."""
 KINDS = tuple(kind for kind in JunkKind if kind is not JunkKind.MANGLED)
 ATTACKER = CLOUDS[1]
 QUIET = "undisturbed"
@@ -43,17 +43,17 @@ QUIET = "undisturbed"
 
 @dataclass(slots=True)
 class Flood:
-    """One lab with its victims, and what was seen."""
+    """A lab with its victims, and the datagrams captured there."""
 
     context: Context
     ours: Ours
     attacker: Remote
     addresses: dict[str, str]
     seen: list[Captured]
-    """From the start on, with the introductions."""
+    """Captured datagrams from the start on, including the introductions."""
     rows: dict[str, list[Row]] = field(default_factory=dict)
     pooled: dict[str, list[float]] = field(default_factory=dict)
-    """By name, the latencies of all repeats, ms."""
+    """Latencies of all repeats by name, ms."""
     arrived: dict[str, list[float]] = field(default_factory=dict)
     cost_us: dict[str, list[float]] = field(default_factory=dict)
     last: dict[str, Calls] = field(default_factory=dict)
@@ -97,7 +97,7 @@ class Flood:
 
     @staticmethod
     def _refused(program: Remote) -> int:
-        """Datagrams that it counted as dropped, for whatever reason."""
+        """Return the datagrams that a program counted as dropped, for any reason."""
         return sum(sum(link["dropped"].values()) for link in program.ask("counters")["links"].values())
 
 

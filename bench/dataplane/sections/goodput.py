@@ -1,4 +1,4 @@
-"""What one path carries on loopback and what it costs: bulk messages, and many small requests."""
+"""Measures what one path carries on loopback and what it costs: bulk messages, and many small requests."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ BULK_BYTES = 1_000_000
 AT_ONCE = 8
 OURS_COUNT = 100
 AIOQUIC_COUNT = 25
-"""It needs many times longer for each."""
+"""Messages for aioquic, which needs many times longer for each."""
 WARM_UP = 10
 SMALL_BYTES = 1_000
 SMALL_COUNT = 3_000
@@ -35,9 +35,9 @@ class Bulk:
 
     mbit_s: float | None
     cpu_ms_per_mb: float
-    """Of all its programs."""
+    """Processor time of all its programs."""
     slices: list[float]
-    """Mbit/s of its stretches."""
+    """Mbit/s of each stretch of the run."""
 
 
 def measure(context: Context) -> Findings:
@@ -154,7 +154,7 @@ def _bulk(program: Remote, count: int) -> Calls:
 
 
 def _costed(programs: tuple[Remote, ...], count: int) -> Bulk:
-    """`count` messages sent by the first program, and what they cost all programs."""
+    """Send `count` messages from the first program; return the run with its cost to all programs."""
     before = sum(program.ask("usage")["cpu_s"] for program in programs)
     calls = _bulk(programs[0], count)
     cpu_s = sum(program.ask("usage")["cpu_s"] for program in programs) - before

@@ -1,6 +1,6 @@
-"""The price of renewed keys: a path whose ends agree on new ones every second, beside one that keeps its keys.
+"""Measures the cost of renewing keys: a path whose ends agree on new ones every second, beside one that keeps them.
 
-That is 120 times as often as by default. The two take turns. A single exchange is timed alone, in this process.
+That is 120 times as often as by default. The two take turns. A single exchange is timed separately, in this process.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from bench.dataplane.section import Context
 
 OFTEN_S, NEVER_S = 1, 86_400
-"""A sidecar's `rekey_after_s`, least and most."""
+"""Minimum and maximum of a sidecar's `rekey_after_s`."""
 SMALL = {"size": 1_000, "rate_hz": 100.0}
 SMALL_COUNT = 1_500
 BULK_BYTES = 1_000_000
@@ -84,7 +84,7 @@ def measure(context: Context) -> Findings:
 
 
 def _exchange_ms() -> float:
-    """Processor time of one exchange, both ends."""
+    """Return the processor time of one exchange, for both ends."""
     rng = random.Random(1)
     one, other = (X25519PrivateKey.from_private_bytes(rng.randbytes(32)) for _ in range(2))
     leader, follower = (

@@ -1,8 +1,8 @@
-"""Large requests over a far link that loses packets: retransmission alone, and with FEC, beside no loss at all.
+"""Measures large requests over a long link that loses packets: retransmission alone, with FEC, and without loss.
 
-150 kB at 10 Hz over one path of 50 ms round trip and 100 Mbit/s; every packet, either way, is lost with the same
-probability. Both ways are alive at once and take turns; each sends some requests before it is measured, so that it
-knows the path.
+150 kB at 10 Hz go over one path of 50 ms round trip and 100 Mbit/s; every packet, in either direction, is lost with the
+same probability. Both variants are alive at once and take turns; each sends some requests before it is measured, so
+that it knows the path.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ SIZE = 150_000
 RATE_HZ = 10.0
 WARM_UP = 20
 COUNT = 170
-"""At the losses that have targets, and without loss: five of three repeats are beyond the P99. Elsewhere a third."""
+"""Requests without loss and at losses with targets: five in three repeats are beyond the P99. A third elsewhere."""
 LOSSES = (0.0, 0.02, 0.01, 0.05)
 JUDGED = (0.0, 0.02)
 LINK = LinkProfile(delay_ms=RTT_MS / 2, rate_kbps=100_000)
@@ -83,12 +83,12 @@ def _start(context: Context, lab: Lab, mode: str) -> Ours:
 
 
 def p99_difference(samples: Sequence[float], others: Sequence[float]) -> float | None:
-    """By how much the P99 of the one lies above that of the others."""
+    """Return by how much the P99 of the samples exceeds that of the others."""
     return difference(p99(samples), p99(others))
 
 
 def _run(ours: Ours, count: int) -> tuple[Calls, float]:
-    """A run, and the bytes sent for each byte of its requests."""
+    """Return a run, and the bytes sent for each byte of its requests."""
     ours.call(size=SIZE, count=WARM_UP, rate_hz=RATE_HZ)
     before = ours.sent_bytes()
     calls = ours.call(size=SIZE, count=count, rate_hz=RATE_HZ)

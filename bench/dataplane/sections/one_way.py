@@ -1,7 +1,7 @@
-"""One-way time of a message on loopback: our engine, aioquic and plain UDP, each as two processes with real sockets.
+"""Measures the one-way time of a message on loopback: our engine, aioquic, plain UDP, each two processes with sockets.
 
-From the moment the message is handed over until the other process has it whole: by our engine's ExecuteRequest, by
-the last byte of its QUIC stream, by the last of its datagrams. All connections live and are warm.
+It runs from the moment the message is handed over until the other process has all of it: by our engine's
+ExecuteRequest, by the last byte of its QUIC stream, by the last of its datagrams. All connections are open and warm.
 """
 
 from __future__ import annotations
@@ -75,7 +75,7 @@ def measure(context: Context) -> Findings:
 
 
 def _start(context: Context, stack: contextlib.ExitStack) -> dict[str, Callable[[int, int], list[float]]]:
-    """Start the contenders; each runs (size, count) and returns one-way milliseconds."""
+    """Start the contenders, each a function of (size, count) that returns one-way milliseconds."""
     start = stack.enter_context
     ethernet = ethernet_loopback(start(Lab(cables())))
     contenders = {

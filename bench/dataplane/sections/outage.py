@@ -1,10 +1,10 @@
-"""All paths dark while the requests go on: the first one sent afterwards must not wait for old ones.
+"""Darkens all paths while requests go on: the first one sent afterwards must not wait for old ones.
 
-120 kB at 10 Hz over two paths, several outages of 2 to 10 s in each run. What is asked in the dark is answered late or
-given up; what counts is the first request sent once a path is seen to be up again, measured from its submission. That
-is a single request of each outage, so that it takes many outages: their median counts, over the P99 of all requests
-before the outages. The links come back at any moment between two requests: what the first one finds depends on it, and
-a run whose outages all end at the same one would tell of that moment alone.
+120 kB at 10 Hz go over two paths, with several outages of 2 to 10 s in each run. Requests sent in the dark are answered
+late or given up. What counts is the first request sent once a path is seen to be up again, measured from its
+submission. That is a single request of each outage, so many outages are needed: their median counts, over the P99 of
+all requests before the outages. The links come back at random times between two requests, since the first request
+depends on that time: a run whose outages all ended at the same one would show that case alone.
 """
 
 from __future__ import annotations
@@ -32,11 +32,12 @@ RATE_HZ = 10.0
 BEFORE_S = 15.0
 LONG_S = 10.0
 DARK_S = (LONG_S, 2.0, LONG_S, 6.0, 3.0, LONG_S, 4.0)
-"""Of each run, to which up to one request's time is added at random. Three long ones: what the figure was at first."""
+"""Outages of each run, each lengthened at random by up to one request's interval. Three are long, as the figure was
+first defined."""
 QUICK_DARK_S = (4.0, 2.0)
 AFTER_S = 2.5
 MARGIN_S = 0.5
-"""Who was sent less than this before the links went dark may have been caught by it."""
+"""A request sent less than this before the links went dark may have been caught by the outage."""
 GRACE_S = 5.0
 WARM_UP = 20
 LINK = LinkProfile(delay_ms=10, rate_kbps=50_000)
@@ -77,31 +78,31 @@ def measure(context: Context) -> Findings:
 
 @dataclass(frozen=True, slots=True)
 class Outage:
-    """When both links went dark, and came back until when; CLOCK_MONOTONIC."""
+    """When both links went dark and came back, and until when they stayed up; CLOCK_MONOTONIC."""
 
     dark: float
     back: float
     until: float
 
     def after(self, calls: Calls) -> Calls:
-        """The requests sent after it, before the next one may catch them."""
+        """Return the requests sent after the outage, before the next one may catch them."""
         return calls.between(self.back, self.until - MARGIN_S)
 
 
 @dataclass(frozen=True, slots=True)
 class Recovery:
-    """What became of one outage's first requests; None when nothing was answered."""
+    """What became of the first requests after an outage; None if nothing was answered."""
 
     up_ms: float | None
-    """From the links' return to the first answer of any request."""
+    """Time from the links' return to the first answer to any request."""
     first_ms: float | None
-    """The first request submitted after the links' return."""
+    """Latency of the first request submitted after the links' return."""
     after_up_ms: float | None
-    """The first request submitted after that first answer."""
+    """Latency of the first request submitted after that first answer."""
 
     @classmethod
     def of(cls, after: Calls, calls: Calls, back: float) -> Recovery:
-        """Read it from the run and from its requests sent after the outage."""
+        """Derive it from the run and its requests sent after the outage."""
         seen = min((at for at in calls.arrivals() if at >= back), default=None)
         if seen is None:
             return cls(None, _first(after), None)
@@ -116,11 +117,11 @@ class Run:
     outages: list[Outage]
 
     def before(self) -> Calls:
-        """The requests before the first outage."""
+        """Return the requests before the first outage."""
         return self.calls.between(0, self.outages[0].dark - MARGIN_S)
 
     def recoveries(self) -> list[Recovery]:
-        """One for each outage."""
+        """Return the recovery from each outage."""
         return [Recovery.of(outage.after(self.calls), self.calls, outage.back) for outage in self.outages]
 
 
@@ -191,7 +192,7 @@ def _intervals(runs: Sequence[Run]) -> dict[str, Interval | None]:
 
 
 def _figures_of_repeats(runs: Sequence[Run]) -> dict[str, float | None]:
-    """The figure as it was defined at first: each repeat's median of its outages of 10 s over its own P99."""
+    """Return the figure as first defined: each repeat's median over its outages of 10 s, over its own P99."""
     ratios = []
     for run in runs:
         long = [
@@ -221,7 +222,7 @@ def _recoveries(runs: Sequence[Run]) -> Table:
 
 
 def _first(calls: Calls) -> float | None:
-    """Latency of the first request, milliseconds; None when it was not answered."""
+    """Return the latency of the first request in milliseconds; None if it was not answered."""
     latency = calls.latency_s[0] if calls.latency_s else None
     return None if latency is None else latency * MS
 

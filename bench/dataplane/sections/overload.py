@@ -1,6 +1,6 @@
-"""A path with a fifth of the rate that it is asked for, beside a good one: the good one must not feel it.
+"""Overloads a path with five times its rate beside a good one, which must not suffer.
 
-120 kB at 10 Hz are 9.6 Mbit/s. Undisturbed, they take the good path only; overloaded, a copy of each also goes to the
+120 kB at 10 Hz are 9.6 Mbit/s. Undisturbed, they take only the good path; overloaded, a copy of each also goes over the
 path of 2 Mbit/s. The two take turns.
 """
 
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 SIZE = 120_000
 RATE_HZ = 10.0
 COUNT = 200
-"""Six of three repeats are beyond the P99."""
+"""Requests of a repeat: six in three repeats are beyond the P99."""
 WARM_UP = 20
 GOOD = LinkProfile(delay_ms=10, rate_kbps=50_000)
 SLOW = LinkProfile(delay_ms=10, rate_kbps=2_000)

@@ -1,7 +1,7 @@
-"""The call of an unmodified ROS 2 client through two sidecars beside the direct call, and with a path gone silent.
+"""Measures calls of an unmodified ROS 2 client through two sidecars, beside direct calls, and with a silent path.
 
-Control plane, two clouds, robot: the installed programs, over plain kernel cables. The direct pair, client and
-server, stands on the robot's host in a ROS domain that no sidecar sees.
+Control plane, two clouds and robot are the installed programs, over plain kernel cables. The direct pair of client and
+server runs on the robot's host in a ROS domain that no sidecar sees.
 """
 
 from __future__ import annotations
@@ -24,9 +24,9 @@ DEADLINE_MS = 500.0
 DIRECT_DOMAIN = 9
 DOMAINS = {"direct": DIRECT_DOMAIN, "proxied": 0}
 SIZES = {"1k": (1_000, 50.0), "150k": (150_000, 10.0)}
-"""Bytes of the request, requests a second."""
+"""Bytes of the request, and requests a second."""
 SECONDS = 6.0
-"""Of each repeat: 180 calls of 150 kB in three."""
+"""Length of each repeat: 180 calls of 150 kB in three."""
 QUICK_SECONDS = 2.0
 RATE_SECONDS = 3.0
 BLACKHOLE_BEFORE_S = 2.0
@@ -127,7 +127,7 @@ def _rate(system: System, domain: int) -> float:
 
 
 def _blackhole(system: System, after_s: float) -> tuple[Calls, float]:
-    """50 requests a second of 1 kB, the first carrier cut in the middle; returns them and the moment of the cut."""
+    """Send 50 requests a second of 1 kB, cut the first carrier in the middle; return them and the time of the cut."""
     seconds = BLACKHOLE_BEFORE_S + after_s
     client = _begin(system, 1_000, 50.0, seconds, DOMAINS["proxied"])
     cut = SilentCut(system.lab)

@@ -1,7 +1,7 @@
-"""One bottleneck, one TCP flow (iperf3) and our bulk messages: neither may starve the other.
+"""Shares one bottleneck between a TCP flow (iperf3) and our bulk messages: neither may starve the other.
 
-20 Mbit/s, 40 ms round trip, a queue of one bandwidth-delay product. Our messages run before the TCP flow begins and
-after it ends; both goodputs are of the TCP flow's time.
+It has 20 Mbit/s, 40 ms round trip, and a queue of one bandwidth-delay product. Our messages run before the TCP flow
+begins and after it ends; both goodputs are measured during the TCP flow.
 """
 
 from __future__ import annotations
@@ -28,15 +28,15 @@ ONE_WAY_MS = 20.0
 LINK = LinkProfile(delay_ms=ONE_WAY_MS, rate_kbps=RATE_KBPS, queue_bytes=round(RATE_KBPS / 8 * 2 * ONE_WAY_MS))
 SIZE = 100_000
 AT_ONCE = 6
-"""600 kB in flight are three times what link and queue hold."""
+"""Messages in flight: 600 kB are three times what link and queue hold."""
 FLOW_S = 10
 QUICK_FLOW_S = 4
 BLOCK_S = 3
-"""Seconds in a row that are drawn together for the interval: TCP grows and halves over some."""
+"""Consecutive seconds drawn together for the interval: TCP's growing and halving spans several."""
 LEAD_S = 2.0
-"""Ours alone, before the TCP flow."""
+"""Time of our messages alone before the TCP flow."""
 CUBIC = ("-C", "cubic")
-"""What most of the internet's senders use, whatever this kernel's default is (RFC 9438)."""
+"""Congestion control of most senders on the internet (RFC 9438), whatever this kernel's default is."""
 PATIENT = {**SERVICE, "deadline_ms": 10_000.0, "lifetime_ms": 60_000.0}
 
 
@@ -97,7 +97,7 @@ def _mean_ratio(tcp: Sequence[float], ours: Sequence[float]) -> float | None:
 
 
 def _rate(arrivals: list[float], start: float, end: float) -> float:
-    """Mbit/s of the messages answered in this stretch."""
+    """Return the Mbit/s of the messages answered in this period."""
     return sum(start <= at < end for at in arrivals) * SIZE * 8 / 1e6 / (end - start)
 
 
