@@ -1,1 +1,1 @@
-"""The matcher's predictions and choices against recorded networks, offline: no lab, no clock."""
+"""Tests the matcher's predictions and choices against recorded networks, offline: without a lab or a clock."""

@@ -1,4 +1,4 @@
-"""Section `calibration`: are predicted miss ratios those observed, and does it help to choose by them?"""
+"""Section `calibration`: do predicted miss ratios match those observed, and does it help to choose by them?"""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Predicted against observed miss ratios: the estimator is fed in time order and asked every second."""
+"""Compares predicted with observed miss ratios: the estimator is fed in time order and queried every second."""
 
 from __future__ import annotations
 
@@ -25,12 +25,12 @@ DEADLINES_S = (0.1, 0.15, 0.25, 0.5, 1.0)
 HALF_LIFE_S = 60.0
 """The control plane's default."""
 REPORTS_PER_PREDICTION = 2
-"""The matcher solves anew every second."""
+"""Reports for each prediction: the matcher solves again every second."""
 KINDS = ("a", "b", "product", "joint")
 FEWEST_MISSES = 30.0
 """Expected misses of a cell below which its observed ratio is mostly chance."""
 NEAR = 1.5
-"""Observed over predicted, or the reverse, that passes where the interval does not hold."""
+"""Ratio of observed to predicted, or the reverse, that passes if the interval does not hold."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,22 +53,22 @@ class Cell:
 
     @property
     def log_error(self) -> float:
-        """|log(observed / expected)|, half a miss added to each."""
+        """|log(observed / expected)|, with half a miss added to each."""
         return abs(math.log((self.observed + 0.5) / (self.expected + 0.5)))
 
     @property
     def inside(self) -> bool:
-        """The observed misses lie in the stated interval."""
+        """Whether the observed misses lie in the stated interval."""
         return self.low <= self.observed <= self.high
 
     @property
     def near(self) -> bool:
-        """Expected and observed differ by a factor of at most `NEAR`."""
+        """Whether expected and observed differ by a factor of at most `NEAR`."""
         return self.expected / NEAR <= self.observed <= self.expected * NEAR
 
 
 def cells_of(races: Races, deadline_s: float, predicted: Arrays) -> Iterator[Cell]:
-    """The cells of one replay by one deadline."""
+    """Yield the cells of one replay with one deadline."""
     counts, estimates, misses = predicted
     first, second = estimates[..., 0], estimates[..., 1]
     low, mean, high = beta.ppf(0.05, first, second), first / (first + second), beta.ppf(0.95, first, second)
@@ -92,7 +92,7 @@ Arrays = tuple["np.ndarray[tuple[int, ...], np.dtype[np.float64]]", ...]
 
 
 def predict(races: Races, deadline_s: float) -> Arrays:
-    """For each report's interval: requests; Beta parameters of each kind; misses on a, on b, on both."""
+    """Return for each report's interval: requests; Beta parameters of each kind; misses on a, on b, on both."""
     rng = random.Random(zlib.crc32(races.trace.encode()))
     reporter = Reporter(deadline_s, rng, size=races.workload.size + ANSWER_BYTES)
     estimator = Estimator(half_life_s=HALF_LIFE_S)
@@ -126,14 +126,14 @@ def predict(races: Races, deadline_s: float) -> Arrays:
 
 
 def predictions(estimator: Estimator, deadline_s: float, now: float) -> tuple[Estimate, ...]:
-    """What is believed of each path, of both together if independent, and as measured."""
+    """Return the estimates of each path, of both together if independent, and of both as measured."""
     one, other = (estimator.estimate(ROBOT, pair.interface, pair.server, SERVICE, deadline_s, now) for pair in PAIRS)
     product = _product(one, other)
     return one, other, product, estimator.both_miss(ROBOT, SERVICE, *PAIRS, product.mean, now)
 
 
 def _product(one: Estimate, other: Estimate) -> Estimate:
-    """The Beta distribution with mean and variance of the product of two independent ones."""
+    """Return the Beta distribution with mean and variance of the product of two independent ones."""
     mean = one.mean * other.mean
     variance = _second_moment(one) * _second_moment(other) - mean * mean
     return Estimate.of(mean, mean * (1.0 - mean) / variance - 1.0)
@@ -144,13 +144,13 @@ def _second_moment(estimate: Estimate) -> float:
 
 
 def share_calibrated(cells: Sequence[Cell]) -> float | None:
-    """Share of cells with enough expected misses that are inside their interval or near; None without any."""
+    """Return the share, among cells with enough expected misses, inside their interval or near; None without any."""
     judged = [cell for cell in cells if cell.expected >= FEWEST_MISSES]
     return sum(cell.inside or cell.near for cell in judged) / len(judged) if judged else None
 
 
 def paired(cells: Sequence[Cell]) -> list[tuple[Cell, Cell]]:
-    """Product and joint cells of the same requests, where either expects, or both observe, enough misses."""
+    """Return product and joint cells of the same requests, where either expects, or both observe, enough misses."""
     joint = {(cell.trace, cell.workload, cell.deadline_s): cell for cell in cells if cell.kind == "joint"}
     pairs = [(cell, joint[cell.trace, cell.workload, cell.deadline_s]) for cell in cells if cell.kind == "product"]
     return [(one, other) for one, other in pairs if max(one.expected, other.expected, one.observed) >= FEWEST_MISSES]

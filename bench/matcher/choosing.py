@@ -1,4 +1,4 @@
-"""One path at a time for each request: the matcher's choice, second by second, beside what others would take."""
+"""Compares choices of one path for each request: the matcher's, second by second, and those of others."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 RIVALS = ("best fixed", "random", "round robin", "lowest mean RTT")
 RTT_MEMORY = 0.98
-"""What a probe leaves of the mean before it: 50 probes, a quarter of a second apart."""
+"""Weight of the previous mean at each probe: a memory of 50 probes, a quarter of a second apart."""
 _CHOICES: tuple[Choice, Choice] = ((0, None), (None, 1))
 
 
@@ -39,7 +39,7 @@ class Chosen:
 
 
 def choose(races: Races, predicted: Arrays) -> Chosen:
-    """Replay the choices. Both paths carry every request, so each choice is judged by what was really seen."""
+    """Replay the choices. Both paths carry every request, so each choice is judged by what was really observed."""
     counts, estimates, misses = predicted
     means = estimates[..., 0] / estimates.sum(axis=-1)
     matcher, switches = _matcher(means[:, :2])
@@ -63,7 +63,7 @@ def choose(races: Races, predicted: Arrays) -> Chosen:
 
 
 def _matcher(means: np.ndarray[tuple[int, ...], np.dtype[np.float64]]) -> tuple[Sequence[int], int]:
-    """The path taken in each interval, and the number of switches: a service that may go to one server only."""
+    """Return the path taken in each interval and the number of switches, for a service limited to one server."""
     key = BlockKey(ROBOT, SERVICE)
     running, stability = Plan({}), Stability()
     chosen: list[int] = []
@@ -87,7 +87,7 @@ def _matcher(means: np.ndarray[tuple[int, ...], np.dtype[np.float64]]) -> tuple[
 
 
 def _lowest_rtt(races: Races, ticks: int) -> Sequence[int]:
-    """The path with the lower mean round trip of the probes answered so far, in each interval."""
+    """Return for each interval the path with the lower mean round trip of the probes answered so far."""
     interval_s = races.duration_s / ticks
     means = [0.0, 0.0]
     chosen: list[int] = []

@@ -26,7 +26,7 @@ PARTS = ("calibration", "useful", "speed", "live")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Options of `python -m bench matcher`."""
+    """Add the options of `python -m bench matcher`."""
     parser.add_argument(
         "--traces", type=Path, help="folder with index.json and NAME.csv.gz (see docs/develop/benchmarks.md)"
     )
@@ -38,7 +38,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    """Measure; returns the exit code: 1 when a target is missed, 2 when the traces are not readable."""
+    """Measure and return the exit code: 1 if a target is missed, 2 if the traces are not readable."""
     console = Console(highlight=False)
     try:
         with console.status("matcher") as status:

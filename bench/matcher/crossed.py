@@ -1,4 +1,4 @@
-"""Both interfaces of a trace to several servers, whose load changes: what a request would take on every pair."""
+"""Crosses both interfaces of a trace with several servers whose load changes: a request's time on every pair."""
 
 from __future__ import annotations
 
@@ -28,24 +28,24 @@ if TYPE_CHECKING:
     from lab.traces import Trace
 
 EXTRA_RTT_S = (0.0, 0.01, 0.03)
-"""How much farther than the trace's own server each server is: in the city, in the country, on the continent."""
+"""Extra round trip of each server beyond the trace's own: in the city, in the country, on the continent."""
 BUSY_FACTOR = 10.0
-"""A busy server takes so much longer: 0.2 s instead of 20 ms."""
+"""How many times longer a busy server takes: 0.2 s instead of 20 ms."""
 BUSY_MEAN_S = 60.0
 BUSY_LEAST_S = 20.0
-"""How long one server is busy before load moves to another one, or to none."""
+"""Least time that one server is busy before load moves to another one, or to none."""
 
 
 @dataclass(frozen=True, slots=True)
 class Load:
-    """Which server is busy when; None: no one is."""
+    """Which server is busy when; None if none is."""
 
     times: tuple[float, ...]
     busy: tuple[int | None, ...]
 
     @classmethod
     def random(cls, servers: int, duration_s: float, rng: random.Random) -> Load:
-        """Load that moves on at random times, always to somewhere else."""
+        """Make load that moves on at random times, always to somewhere else."""
         times, busy = [0.0], [rng.choice((None, *range(servers)))]
         while times[-1] < duration_s:
             times.append(times[-1] + BUSY_LEAST_S + rng.expovariate(1.0 / (BUSY_MEAN_S - BUSY_LEAST_S)))
@@ -53,21 +53,21 @@ class Load:
         return cls(tuple(times), tuple(busy))
 
     def at(self, now: float, start: int) -> int:
-        """The stretch that `now` is in, looked for from stretch `start` on."""
+        """Return the stretch that contains `now`, searching from stretch `start` on."""
         while start + 1 < len(self.times) and self.times[start + 1] <= now:
             start += 1
         return start
 
 
 def pairs_of(servers: int, interfaces: tuple[str, ...] = PATHS) -> tuple[Assignment, ...]:
-    """All pairs of an interface and a server, in the order of a crossed race's paths."""
+    """Return all pairs of an interface and a server, in the order of a crossed race's paths."""
     return tuple(
         Assignment(InterfaceName(path), NodeName(f"cloud-{server}")) for path in interfaces for server in range(servers)
     )
 
 
 class _Crossing:
-    """One interface: all requests go up its link, whatever the server; each server's answers have their own way."""
+    """One interface: all requests share its uplink, whatever the server; each server's answers have their own way."""
 
     def __init__(self, trace: Trace, path: str, servers: int) -> None:
         steps = trace.path(path)
@@ -75,7 +75,7 @@ class _Crossing:
         self._down = [FifoLink(steps, up=False) for _ in range(servers)]
 
     def send(self, at: float, size: int, answer: int, processing: tuple[float, ...], rng: random.Random) -> list[float]:
-        """Seconds until each server's answer; inf if lost."""
+        """Return the seconds until each server's answer; inf if lost."""
         arrived = self._up.send(at, size, rng)
         if math.isinf(arrived):
             return [math.inf] * len(self._down)
@@ -86,7 +86,7 @@ class _Crossing:
 
 
 def cross(trace: Trace, workload: Workload, servers: int) -> Races:
-    """Send the workload over both interfaces to all of so many servers. The same every time."""
+    """Send the workload over both interfaces to all servers; the result is the same every time."""
     rng = random.Random(zlib.crc32(f"{trace.name} {workload.name} {servers}".encode()))
     load = Load.random(servers, trace.duration_s, rng)
     crossings = [_Crossing(trace, path, servers) for path in PATHS]

@@ -1,4 +1,4 @@
-"""A fleet in front of a control plane's core: what robots and clouds register, and what robots report."""
+"""Simulates a fleet at a control plane's core: the registrations of robots and clouds, and the robots' reports."""
 
 from __future__ import annotations
 
@@ -34,17 +34,17 @@ SERVICE = ServiceName("/bench")
 TYPE = "nav_msgs/srv/GetPlan"
 DEADLINE_S = 0.1
 ROOM = 1.1
-"""What all servers take together, over what all robots want."""
+"""Capacity of all servers together over the demand of all robots."""
 PROCESSING_S = 0.01
 REQUESTS = 5
-"""Of one robot between two reports."""
+"""Requests of one robot between two reports."""
 SOLVE_LIMIT_S = 60.0
 SETTLE_S = 1.0
-"""From the fleet's reports to a routine solving: long enough for it to be due."""
+"""Time from the fleet's reports to a routine solving: long enough for it to be due."""
 
 
 class Crowd:
-    """Robots and clouds, each with one stream of one core; time is simulated."""
+    """Robots and clouds, each with one stream to the same core; time is simulated."""
 
     def __init__(self, robots: int, interfaces: int, servers: int, *, seed: int) -> None:
         self.now = 0.0
@@ -52,7 +52,7 @@ class Crowd:
         self.matcher = Matcher()
         self.mappings: dict[NodeName, MappingSet] = {}
         self.turns: dict[str, list[float]] = {"report": [], "draw": [], "settle": []}
-        """Seconds that each call of the core took, for which all streams of a control plane wait."""
+        """Seconds that each call of the core took; all streams of a control plane wait that long."""
         self._rng = random.Random(seed)
         self._owner: dict[StreamId, NodeName] = {}
         self._stream: dict[NodeName, StreamId] = {}
@@ -93,8 +93,8 @@ class Crowd:
         self.core.receive(stream, services, self.now)
 
     def report(self, robot: NodeName, *, dead: Collection[str] = ()) -> Report:
-        """What a robot measured: probes over every path, requests over those of its mapping. No path over interfaces
-        that are `dead` is up."""
+        """Return what a robot measured: probes over every path, requests over those of its mapping. No path over `dead`
+        interfaces is up."""
         paths = []
         for interface in self._interfaces:
             for server in self._servers:
@@ -127,7 +127,7 @@ class Crowd:
         return mapping.services[0].assignments if mapping is not None and mapping.services else ()
 
     def tell(self, robot: NodeName, report: Report) -> None:
-        """The core gets a report."""
+        """Hand a report to the core."""
         with self._turn("report"):
             self.core.receive(self._stream[robot], report, self.now)
 
@@ -138,7 +138,7 @@ class Crowd:
         self.turns[kind].append(time.perf_counter() - began)
 
     def tell_all(self) -> None:
-        """All robots report, and the plan that follows is made and sent."""
+        """Let all robots report, and make and send the plan that follows."""
         for robot in self.robots:
             self.tell(robot, self.report(robot))
         self.now += SETTLE_S
@@ -146,7 +146,7 @@ class Crowd:
         self.solve()
 
     def solve(self) -> int:
-        """Do what is due, as the driver does; returns how many mappings were sent."""
+        """Do what is due, as the driver does; return how many mappings were sent."""
         picture = None
         while picture is None:
             with self._turn("draw"):
@@ -157,7 +157,7 @@ class Crowd:
         return self.drain()
 
     def drain(self) -> int:
-        """Take what the core sends; returns how many mappings that were."""
+        """Take what the core sends; return how many mappings there were."""
         mappings = 0
         while (event := self.core.next_event()) is not None:
             if isinstance(event, Send) and isinstance(event.message, MappingSet):

@@ -1,4 +1,4 @@
-"""A race's outcomes as the sidecar would report them, in reports of half a second."""
+"""Reports a race's outcomes as the sidecar would, in reports of half a second."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 REPORT_INTERVAL_S = 0.5
 LIFETIME_S = 10.0
-"""When a request that nobody answers is given up: the shortest default."""
+"""Time after which an unanswered request is given up: the shortest default."""
 
 ROBOT = NodeName("robot")
 SERVICE = ServiceName("/detect")
@@ -61,17 +61,17 @@ class Reporter:
         self._rng = rng
         self._pairs = pairs
         self._news: list[_News] = []
-        """Latencies and when they are known."""
+        """Latencies, and when they become known."""
         self._judged: list[tuple[float, int, tuple[tuple[int, bool], ...], bool]] = []
-        """When it is known which path has missed, a number to tell them apart, each path and whether it missed, and
+        """When it becomes known which paths missed, a number to tell races apart, each path and whether it missed, and
         whether the race is a full one."""
         self._raced = 0
         self._probes: list[tuple[float, int, float]] = []
 
     def raced(self, race: Race, carried: Sequence[int] | None = None, *, full: bool | None = None) -> None:
-        """A request went out over these paths (by default all of them).
+        """Note a request sent over these paths (by default all of them).
 
-        `full`: none of its copies is called off before the deadline; by default that is left to chance, as in a
+        With `full`, none of its copies is cancelled before the deadline; by default that is left to chance, as in a
         sidecar. A single copy is always measured.
         """
         paths = range(len(self._pairs)) if carried is None else carried
@@ -86,7 +86,7 @@ class Reporter:
         won = any(not late for _, late in missed)
         for path, late in missed if full else ():
             latency, processing = race.latency_s[path], race.processing_s[path]
-            # The answer is small: what is on its way for so long has not arrived at its server yet.
+            # The answer is small: a request under way for this long has not reached its server yet.
             if late and won and latency - processing > self._deadline_s:
                 known, ended = self._deadline_s, _Ended.CALLED_OFF
             elif latency > LIFETIME_S:
@@ -96,9 +96,9 @@ class Reporter:
             heapq.heappush(self._news, _News(race.at_s + known, path, ended, known, processing))
 
     def rescued(self, race: Race, path: int) -> None:
-        """The request had no answer by its deadline, so a copy went over this path: started late, it is not judged.
+        """Note a copy sent over this path after the deadline without an answer: it started late, so it is not judged.
 
-        What it takes is taken for what the request itself would have taken there.
+        Its latency is assumed to be what the request itself would have had there.
         """
         latency = race.latency_s[path]
         if latency <= LIFETIME_S - self._deadline_s:
@@ -106,11 +106,11 @@ class Reporter:
             heapq.heappush(self._news, _News(known_at, path, _Ended.ANSWERED, latency, race.processing_s[path]))
 
     def probed(self, probe: Probe) -> None:
-        """A probe went out."""
+        """Note a probe that was sent."""
         heapq.heappush(self._probes, (probe.at_s + min(probe.rtt_s, PROBE_TIMEOUT_S), probe.path, probe.rtt_s))
 
     def take(self, now: float) -> Report:
-        """The report of what is known by `now` and was not reported yet."""
+        """Return the report of what is known by `now` and not reported yet."""
         network, called_off, processing, rtts = ([Histogram() for _ in self._pairs] for _ in range(4))
         judged, missed, joints = self._outcomes(now)
         while self._news and self._news[0].at_s <= now:
@@ -149,7 +149,7 @@ class Reporter:
         )
 
     def _outcomes(self, now: float) -> tuple[Counter[int], Counter[int], tuple[JointReport, ...]]:
-        """By path, requests and misses among them; and by pair of paths."""
+        """Return requests and misses by path, and by pair of paths."""
         judged: Counter[int] = Counter()
         missed: Counter[int] = Counter()
         together: Counter[tuple[int, int]] = Counter()

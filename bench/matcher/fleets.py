@@ -1,7 +1,7 @@
-"""Random fleets, and the optimum that a minimum-cost flow finds for them.
+"""Makes random fleets, and finds their optimum by a minimum-cost flow.
 
-Servers are nearer and farther, interfaces better and worse, and each path differs from both by some. Every server has
-its share of all interfaces as capacity, and `ROOM` times that.
+Servers are nearer or farther, interfaces better or worse, and each path differs somewhat from both. The capacity of
+every server is its share of all interfaces times `ROOM`.
 """
 
 from __future__ import annotations
@@ -20,15 +20,15 @@ from protos.model.ids import InterfaceName, NodeName, ServiceName
 SERVICE = ServiceName("/bench")
 ROOM = 1.1
 MOST_TRIED, TRIED = 20, 4
-"""Servers up to which each path was tried with each other; beyond, so many of each interface were."""
+"""Up to MOST_TRIED servers, each path was tried with each other; beyond, TRIED paths of each interface were."""
 FLOW_UNIT = 1e-6
-"""The flow counts costs in whole numbers of this."""
+"""Unit of costs in the flow, which counts in integers."""
 
 
 def random_fleet(
     robots: int, interfaces: int, servers: int, *, seed: int, lifts: bool = False, room: float = ROOM
 ) -> Problem:
-    """A fleet that wants the least joint miss probability; with `lifts` pairs of paths fail together somewhat."""
+    """Return a fleet that wants the least joint miss probability; with `lifts` pairs of paths tend to fail together."""
     rng = random.Random(seed)
     distances = [0.3 + rng.random() for _ in range(servers)]
     names = tuple(NodeName(f"cloud-{j}") for j in range(servers))
@@ -40,7 +40,7 @@ def random_fleet(
 
 
 def in_regions(problem: Problem, regions: int, *, seed: int) -> Problem:
-    """The fleet with its servers in so many regions."""
+    """Return the fleet with its servers in this many regions."""
     rng = random.Random(seed)
     labels = tuple(f"region-{rng.randrange(regions)}" for _ in problem.blocks[0].servers)
     return replace(problem, blocks=tuple(replace(block, regions=labels) for block in problem.blocks))
@@ -49,7 +49,7 @@ def in_regions(problem: Problem, regions: int, *, seed: int) -> Problem:
 def random_block(
     rng: random.Random, robot: str, interfaces: int, distances: list[float], names: tuple[NodeName, ...], *, lifts: bool
 ) -> Block:
-    """One robot of such a fleet."""
+    """Return one robot of such a fleet."""
     carriers = [10 ** rng.uniform(-3, -0.5) for _ in range(interfaces)]
     found: dict[tuple[Path, Path], float] = {}
     if lifts:
@@ -68,7 +68,7 @@ def random_block(
 
 
 def flow_optimum(problem: Problem) -> float:
-    """The least cost of a fleet without lifts: each interface sends one unit over (robot, server) to the server."""
+    """Return the least cost of a fleet without lifts: each interface sends a unit to a server over (robot, server)."""
     robots, interfaces = len(problem.blocks), len(problem.blocks[0].interfaces)
     servers = len(problem.blocks[0].servers)
     costs = np.array([path_costs(problem.objective, epsilon_matrix(block)) for block in problem.blocks])

@@ -1,8 +1,8 @@
 """Section `live`: two servers of the real system swap load, and the mapping follows.
 
 There is one server more than the robot has interfaces, and the one that it does not use is too busy for the deadline.
-Then that one is idle, and one of the robot's own is busy. In between the sidecar saves the requests: another copy is in
-time, or, where there is none, it asks another server at half the deadline.
+Then that one becomes idle, and one of the robot's own busy. In between the sidecar saves the requests: another copy is
+in time or, if there is none, it asks another server at half the deadline.
 """
 
 from __future__ import annotations
@@ -34,26 +34,26 @@ RATE_HZ = 20
 BURDEN_MS = 250.0
 LINKS = {"wlan0": LinkProfile(delay_ms=5, jitter_ms=2), "wwan0": LinkProfile(delay_ms=15, jitter_ms=5)}
 INTERFACES = (1, 2)
-"""With so many in turn, and one server more."""
+"""Numbers of interfaces, tried in turn, each with one server more."""
 BEFORE_S = 20.0
-"""So long the other server is busy before they swap."""
+"""How long the other server is busy before they swap."""
 FOLLOW_S = 60.0
-"""The new mapping comes in this time, on a machine however busy."""
+"""Time within which the new mapping comes, however busy the machine."""
 AFTER_S = 3.0
-"""Requests that still go out once the mapping followed."""
+"""How long requests still go out once the mapping has followed."""
 
 
 @dataclass(frozen=True, slots=True)
 class Followed:
-    """What came of it."""
+    """The result of a swap."""
 
     seconds: float
-    """From the swap to the new mapping at the robot's stream."""
+    """Time from the swap to the new mapping at the robot's stream."""
     reason: str
-    """Of the change, as `plr explain` tells it."""
+    """Reason of the change, as shown by `plr explain`."""
     sent: int
     lost: int
-    """Requests not answered, or wrongly, or twice."""
+    """Requests answered not at all, wrongly or twice."""
     late: int
 
 
@@ -81,7 +81,7 @@ def measure(say: Callable[[str], None]) -> Findings:
 
 
 def swap_load(folder: Path, *, interfaces: int, before_s: float = BEFORE_S) -> Followed:
-    """Bring the system up, swap the load of two servers after so many seconds, wait until the mapping followed."""
+    """Bring the system up, swap the load of two servers after `before_s`, and wait until the mapping has followed."""
     links, clouds = dict(list(LINKS.items())[:interfaces]), CLOUDS[: interfaces + 1]
     with Lab(LabConfig.of(interfaces=tuple(links), clouds=len(clouds)), seed=1) as lab:
         for name, profile in links.items():
@@ -121,7 +121,7 @@ def _swap(system: System, links: tuple[str, ...], clouds: tuple[str, ...], befor
     del system.parts[client.name]
     run = read_json(out)
     summary = run["summary"]
-    # What it asked for in its last moments need not be answered: it was stopped.
+    # Requests of its last moments need not be answered: the client was stopped.
     last = max(request["sent_s"] for request in run["requests"])
     open_then = [r for r in run["requests"] if r["latency_ms"] is None and r["sent_s"] < last - AFTER_S / 2]
     lost = len(open_then) + summary["answered_twice"] + summary["invalid"] + summary["strangers"]
@@ -149,7 +149,7 @@ def _burden(system: System, clouds: tuple[str, ...], *, busy: str) -> None:
 
 
 def _mapped(system: System) -> set[str]:
-    """The servers of the mapping that the robot holds."""
+    """Return the servers of the mapping that the robot holds."""
     try:
         last = decode_last_good((system.folder / "robot.state" / LAST_GOOD_FILE).read_bytes(), NodeName("robot"))
     except (OSError, DecodeError):

@@ -1,7 +1,7 @@
-"""The control plane's core against changing networks and servers, as they come: what its mappings would have missed.
+"""Replays changing networks and servers to the control plane's core, and counts what its mappings would have missed.
 
-It sees what a robot's sidecar would report, no more: the requests that went over mapped pairs, a few that explored
-others, and probes of every pair.
+The core sees only what a robot's sidecar would report: the requests over mapped pairs, a few that explored others, and
+probes of every pair.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 
 RIVALS = ("best fixed", "random", "round robin", "lowest mean RTT")
 Mapping = tuple[int, ...]
-"""For each interface the server."""
+"""The server of each interface."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,19 +52,19 @@ class Online:
 
 @dataclass(frozen=True, slots=True)
 class Tick:
-    """What went on between two reports."""
+    """What happened between two reports."""
 
     at_s: float
     mapping: ServiceMapping | None
     carried: tuple[int, ...]
     """The pairs that carried each request, by number."""
     missed: int
-    """Requests all of whose copies were late."""
+    """Requests whose copies were all late."""
     explored: int
 
 
 def replayed(races: Races, deadline_s: float, pairs: Sequence[Assignment]) -> Iterator[Tick]:
-    """Replay the requests with whatever mapping the control plane has told by then."""
+    """Replay the requests with the mapping that the control plane has sent by then."""
     number_of = {pair: number for number, pair in enumerate(pairs)}
     servers = len({pair.server for pair in pairs})
     rng = random.Random(zlib.crc32(f"{races.trace} {servers}".encode()))
@@ -74,7 +74,7 @@ def replayed(races: Races, deadline_s: float, pairs: Sequence[Assignment]) -> It
     probe, race = next(probes, None), next(waiting, None)
     budget = ExplorationBudget(0.0)
     rtts: dict[int, float] = {}
-    """Of the last probe of each path: a request in trouble takes the best one."""
+    """Round trip of the last probe of each path: a request in trouble takes the best path."""
     for tick in range(math.ceil(races.duration_s / REPORT_INTERVAL_S)):
         now = tick * REPORT_INTERVAL_S
         missed = explored = 0
@@ -106,7 +106,7 @@ def replayed(races: Races, deadline_s: float, pairs: Sequence[Assignment]) -> It
 
 
 def follow(races: Races, deadline_s: float, servers: int) -> Online:
-    """Replay the requests over both interfaces to so many servers, and by the rivals' choices."""
+    """Replay the requests over both interfaces to this many servers, and by the rivals' choices."""
     ticks = list(replayed(races, deadline_s, pairs_of(servers)))
     switches = sum(
         bool(before.carried) and set(before.carried) != set(after.carried)
@@ -137,7 +137,7 @@ def _rivals(races: Races, deadline_s: float, servers: int) -> dict[str, float]:
 
 
 def _lowest_rtt(races: Races, servers: int, ticks: int) -> list[Mapping]:
-    """For each interval: pair after pair by the mean round trip of the probes answered so far, lowest first."""
+    """Return for each interval the pairs by mean round trip of the probes answered so far, lowest first."""
     means = [0.0] * (len(PATHS) * servers)
     chosen: list[Mapping] = []
     probes = iter(races.probes)

@@ -1,4 +1,4 @@
-"""The control plane's core with one robot and its servers, in simulated time."""
+"""Runs the control plane's core with one robot and its servers, in simulated time."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 
 FOREVER_S = 1e9
 JOINED_S = -2.0
-"""When all have come, before the first request."""
+"""When all have registered, before the first request."""
 SOLVER_LIMIT_S = 1.0
 TYPE = "bench/srv/Detect"
 
@@ -71,7 +71,7 @@ class Plane:
         return stream
 
     def take(self, message: SidecarMessage, now: float) -> None:
-        """The robot says this; the mapping that follows is in force at once."""
+        """Take a message of the robot; the mapping that follows is in force at once."""
         self._core.receive(self._robot, message, now)
         self._advance(now)
 

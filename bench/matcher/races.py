@@ -1,4 +1,4 @@
-"""What a robot that sends every request over both paths of a trace would see."""
+"""Simulates what a robot that sends every request over both paths of a trace would see."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 ANSWER_BYTES = 1000
 PROCESSING_MEDIAN_S = 0.02
 PROCESSING_SIGMA = 0.25
-"""Servers take a log-normal time: a detector on a GPU that others use as well."""
+"""Spread of the servers' log-normal time: a detector on a GPU that others use as well."""
 PATHS = ("a", "b")
 PROBE_BYTES = 100
 PROBE_INTERVAL_S = 0.25
@@ -31,14 +31,14 @@ class Workload:
 
 
 PINGS = (Workload("1 kB 10/s", 1000, 10.0),)
-"""All that a trace of pings can carry: it knows nothing of capacity."""
+"""Workloads for a trace of pings, which does not show capacity."""
 IMAGES = (Workload("20 kB 10/s", 20_000, 10.0), Workload("120 kB 5/s", 120_000, 5.0))
 """Small and large pictures; the latter as the paper's driving study sends them."""
 
 
 @dataclass(frozen=True, slots=True)
 class Race:
-    """One request on every path: seconds until each answer, inf if lost, and each server's share of it."""
+    """One request on every path: seconds until each answer, inf if lost, and each server's part of that time."""
 
     at_s: float
     latency_s: tuple[float, ...]
@@ -47,7 +47,7 @@ class Race:
 
 @dataclass(frozen=True, slots=True)
 class Probe:
-    """A small packet there and back on one path; inf if lost."""
+    """Round trip of a small packet on one path; inf if lost."""
 
     at_s: float
     path: int
@@ -66,19 +66,19 @@ class Races:
 
 
 def workloads_for(kind: str) -> tuple[Workload, ...]:
-    """What may be sent through a trace of this kind (`rtt` or `rate`)."""
+    """Return the workloads for a trace of this kind (`rtt` or `rate`)."""
     return PINGS if kind == "rtt" else IMAGES
 
 
 def replay(trace: Trace, workload: Workload) -> Races:
-    """Send the workload over both paths from the trace's start to its end. The same every time."""
+    """Send the workload over both paths from the trace's start to its end; the result is the same every time."""
     rng = random.Random(zlib.crc32(f"{trace.name} {workload.name}".encode()))
     paths = [FifoPath(trace.path(name)) for name in PATHS]
     races: list[Race] = []
     probes: list[Probe] = []
     interval = 1.0 / workload.per_second
     for number in range(int(trace.duration_s * workload.per_second)):
-        # Not in step with the trace, whose rows change at whole seconds.
+        # Avoid sending in step with the trace, whose rows change at whole seconds.
         at = (number + rng.random()) * interval
         while len(probes) // 2 * PROBE_INTERVAL_S < at:
             probe_at = len(probes) // 2 * PROBE_INTERVAL_S

@@ -1,4 +1,4 @@
-"""Which traces there are to replay: recorded ones, or made-up ones in their place."""
+"""Finds the traces to replay: recorded ones, or generated ones in their place."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ MADE_UP_S = 600.0
 
 
 def load(folder: Path | None) -> tuple[list[tuple[Trace, str]], str]:
-    """Traces with their kinds (`rate` or `rtt`), and a note where made-up ones stand in for recorded ones.
+    """Return traces with their kinds (`rate` or `rtt`), and a note if generated ones replace recorded ones.
 
     Raises:
         LabConfigError: a trace is not readable.

@@ -1,4 +1,4 @@
-"""Section `speed`: how long plans of fleets take, and how far they are from the best."""
+"""Section `speed`: how long plans of fleets take, and how far they are from the optimum."""
 
 from __future__ import annotations
 
@@ -27,28 +27,28 @@ if TYPE_CHECKING:
     from controlplane.core.problem.problem import Problem
 
 OVERLOAD_ROOM = 0.9
-"""What servers can take, over what is wanted."""
+"""Capacity of the servers over the demand."""
 
 
 @dataclass(frozen=True, slots=True)
 class Fleet:
-    """A fleet to be solved from nothing."""
+    """A fleet to be solved from scratch."""
 
     robots: int
     interfaces: int
     servers: int
     kind: str = ""
-    """What else: `lifts` (paths fail together), `regions` (so many that copies should not share, and the control
-    plane's own time limit), `sum_overload` (that objective, too few servers)."""
+    """Variant: `lifts` (paths fail together), `regions` (several that copies should not share, and the control plane's
+    own time limit), `sum_overload` (that objective, too few servers)."""
 
     @property
     def name(self) -> str:
-        """In the figures' keys."""
+        """Name in the figures' keys."""
         shape = f"{self.robots}x{self.interfaces}x{self.servers}"
         return f"{shape}_{self.kind}" if self.kind else shape
 
     def problem(self) -> Problem:
-        """The problem."""
+        """Return the problem."""
         overloaded = self.kind == "sum_overload"
         problem = random_fleet(
             self.robots,
@@ -76,15 +76,15 @@ TIME_LIMIT_S = 60.0
 DEFAULT_LIMIT_S = int(ControlPlaneConfig.model_fields["solver_time_limit_ms"].default) / 1000
 RECORDS = 1_000_000
 CHANGES = 60
-"""Robots whose estimates change, one after the other."""
+"""Number of robots whose estimates change, one after the other."""
 ROUNDS_TO_WARM_UP, ROUNDS = 3, 10
-"""Times that each robot of the fleet reports."""
+"""How often each robot of the fleet reports."""
 SPACING_S = 0.02
-"""Between two of them."""
+"""Time between two changes."""
 
 
 def measure(say: Callable[[str], None], *, quick: bool) -> Findings:
-    """Solve fleets from nothing, and one robot after the other of a fleet."""
+    """Solve fleets from scratch, and one robot after the other of a fleet."""
     findings = Findings()
     rows: list[tuple[str | Figure, ...]] = []
     for fleet in QUICK_FLEETS if quick else FLEETS:
@@ -110,8 +110,8 @@ def measure(say: Callable[[str], None], *, quick: bool) -> Findings:
 
 
 def _turns(crowd: Crowd, findings: Findings) -> None:
-    """How long all streams wait for one report, a slice of a new problem, and a plan to be put in force, when the whole
-    fleet reports once a second."""
+    """Measure how long all streams wait for one report, a slice of a new problem, and a plan to be put into force, when
+    the whole fleet reports once a second."""
     crowd.turns = {kind: [] for kind in crowd.turns}
     for _ in range(ROUNDS):
         crowd.tell_all()
@@ -121,7 +121,7 @@ def _turns(crowd: Crowd, findings: Findings) -> None:
 
 
 def _from_report_to_mapping(crowd: Crowd, findings: Findings) -> None:
-    """The whole way in the control plane: a path of one robot dies, and its new mapping is there to be sent."""
+    """Measure the whole way in the control plane: a path of one robot dies, and its new mapping is ready to be sent."""
     took, took_cpu, sent = [], [], 0
     for robot in random.Random(3).sample(crowd.robots, CHANGES):
         report = crowd.report(robot, dead=("if0",))
@@ -181,7 +181,7 @@ def _one_by_one(name: str, lifts: bool, findings: Findings) -> None:
 
 
 def _histogram() -> dict[str, Figure]:
-    """Million records a second of CPU time, one by one and in batches."""
+    """Return million records a second of CPU time, one by one and in batches."""
     values = np.random.default_rng(1).lognormal(-3.0, 1.0, RECORDS)
     histogram = Histogram()
     began = time.process_time()

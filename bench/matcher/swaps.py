@@ -1,4 +1,4 @@
-"""Load that moves between servers, over a network that does not change: how long until the mapping follows?"""
+"""Moves load between servers over an unchanging network: how long until the mapping follows?"""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ if TYPE_CHECKING:
 DEADLINE_S = 0.15
 NETWORK_S, NETWORK_SIGMA = 0.02, 0.2
 SLOW_S = 0.3
-"""What the network takes now and then."""
+"""Time that the network takes for slow requests."""
 IDLE_S, BUSY_S, COMPUTE_SIGMA = 0.02, 0.25, 0.25
 SWAPS = 4
 APART_S = (20.0, 80.0)
-"""From one swap to the next, and before the first."""
+"""Range of the time between swaps, and before the first."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,24 +30,24 @@ class Scene:
     """A robot's interfaces and servers, of which one is busy at a time."""
 
     slow_shares: tuple[float, ...]
-    """For each interface, how many of its requests miss the deadline whichever server they go to."""
+    """Share of each interface's requests that miss the deadline at any server."""
     servers: int
     per_second: float = 20.0
 
 
 @dataclass(frozen=True, slots=True)
 class Swap:
-    """One time that load moved on."""
+    """One move of the load."""
 
     at_s: float
     follow_s: float
-    """Until the mapping avoided the server that got busy; inf if it did not before the next swap."""
+    """Time until the mapping avoided the server that became busy; inf if it did not before the next swap."""
     late: int
-    """Requests all of whose copies were late meanwhile."""
+    """Requests whose copies were all late meanwhile."""
 
 
 def swap(scene: Scene, seed: int) -> Iterator[Swap]:
-    """Let load move a few times, always to a server in use; the same every time."""
+    """Let load move a few times, always to a server in use; the result is the same every time."""
     rng = random.Random(zlib.crc32(f"{scene} {seed}".encode()))
     at = list(itertools.accumulate(rng.uniform(*APART_S) for _ in range(SWAPS + 1)))
     busy = [rng.randrange(scene.servers)]
@@ -69,7 +69,7 @@ def swap(scene: Scene, seed: int) -> Iterator[Swap]:
 
 
 def _suffers(scene: Scene, carried: tuple[int, ...], busy: int) -> bool:
-    """Whether an interface goes to the busy server that need not, or the better one where one of them must."""
+    """Return whether an interface uses the busy server needlessly, or the better one does where one of them must."""
     burdened = [divmod(pair, scene.servers)[0] for pair in carried if pair % scene.servers == busy]
     if scene.servers > len(scene.slow_shares):
         return bool(burdened)

@@ -1,4 +1,4 @@
-"""What the matcher's figures are held against; speeds on two cores."""
+"""Defines the targets of the matcher's figures; speeds are for two cores."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Section `useful`: do robots miss fewer deadlines with the control plane's mappings than with other ones?"""
+"""Section `useful`: do robots miss fewer deadlines with the control plane's mappings than with others?"""
 
 from __future__ import annotations
 
@@ -24,13 +24,13 @@ SERVERS = (2, 3)
 LARGE_BYTES = 100_000
 DEADLINE_S = 0.25
 LARGE_DEADLINE_S = 0.5
-"""Of requests of `LARGE_BYTES` and more."""
+"""Deadline of requests of `LARGE_BYTES` and more."""
 
 
 def measure(folder: Path | None, say: Callable[[str], None], *, quick: bool) -> Findings:
     """Replay every trace (of many of a family, one, if `quick`), with two servers and three in turn.
 
-    What the matcher's constants were chosen by are traces with even numbers; the others were held out.
+    The matcher's constants were chosen on traces with even numbers; the others were held out.
     """
     traces, note = load(folder)
     jobs = [
