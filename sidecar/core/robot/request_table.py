@@ -19,7 +19,6 @@ from typing import TYPE_CHECKING
 
 from protos.base.histogram import Histogram
 from protos.model.mapping import Assignment
-from protos.model.redundancy_mode import RedundancyMode
 from sidecar.core.base.slices import GROUP, rest
 from sidecar.core.base.timers import first_of
 from sidecar.core.base.values import PathId, PathState, RejectReason, RequestId
@@ -454,7 +453,7 @@ class RequestTable:
     def on_copy_lost(self, message: OutboundMessage, now: float) -> None:
         """Send the backup now if the message of which nothing is heard is a copy that has one."""
         request = None if message.copy_of is None else self._requests.get(message.copy_of)
-        if request is None or request.done or request.rule.redundancy is not RedundancyMode.BACKUP:
+        if request is None or request.done or not self._dispatching.replaces_lost(request):
             return
         waiting = request.relied_on()
         if len(waiting) == 1 and waiting[0].message.newest is message:

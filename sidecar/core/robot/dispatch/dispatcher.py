@@ -9,13 +9,13 @@ from __future__ import annotations
 import enum
 from typing import TYPE_CHECKING
 
-from protos.model.redundancy_mode import RedundancyMode
 from sidecar.core.base.values import PathState
 from sidecar.core.robot.dispatch.adaptive import Adaptive
 from sidecar.core.robot.dispatch.budgets import Budgets
 from sidecar.core.robot.dispatch.exploration import Exploration
+from sidecar.core.robot.dispatch.modes import MODES
 from sidecar.core.robot.dispatch.pair_history import PathPaces, PathRecords
-from sidecar.core.robot.request.request import HEDGE_AT, Copy, CopyState, Request
+from sidecar.core.robot.request.request import Copy, CopyState, Request
 from sidecar.core.wire.messages import RequestMessage, encode_message
 
 if TYPE_CHECKING:
@@ -50,9 +50,9 @@ class Dispatching:
     def __init__(self, parts: RequestParts) -> None:
         self._parts = parts
         self._exploration = Exploration(parts.mapping, parts.routes, parts.outbox)
-        self._records = PathRecords(parts.stats)
+        self.records = PathRecords(parts.stats)
         self._paces = PathPaces(parts.routes, parts.stats)
-        self._adaptive = Adaptive(parts.routes, self._paces)
+        self.adaptive = Adaptive(parts.routes, self._paces)
         self._budgets = Budgets(parts.budgets, parts.stats)
 
     def with_room(self, servers: Iterable[NodeName], request: Request) -> list[NodeName]:
@@ -74,7 +74,7 @@ class Dispatching:
         rule = request.rule
         servers = self._favoured(servers, now)
         chosen = self._parts.mapping.choose(request.service, servers, idempotent=rule.idempotent)
-        if rule.redundancy is RedundancyMode.REPLICATE:
+        if MODES[rule.redundancy].at_once:
             paths = self._best_first(request, chosen, now) if self._budgets else chosen
             request.withheld = tuple(path for path in paths if not self._send(request, path, now, _Why.MAPPED))
         else:
@@ -97,78 +97,39 @@ class Dispatching:
         while paths and not request.copies:
             self._send(request, paths.pop(0), now, _Why.MAPPED)
         request.withheld = tuple(paths)
-        if request.copies and request.rule.redundancy is not RedundancyMode.ADAPTIVE:
-            self.rescue(request, now)
+        if request.copies:
+            MODES[request.rule.redundancy].begun(self, request, now)
 
     def _best_first(self, request: Request, paths: Iterable[PathId], now: float) -> list[PathId]:
-        """Sort paths: those that are up first, among them those that missed least recently, then the fastest.
-
-        With RedundancyMode.ADAPTIVE the currently fastest come first: misses and rescues make a pair slow as well.
-        """
-        adaptive = request.rule.redundancy is RedundancyMode.ADAPTIVE
+        """Sort paths: those that are up first, among them the best by the mode, then the fastest."""
+        mode, routes = MODES[request.rule.redundancy], self._parts.routes
 
         def order(path: PathId) -> tuple[bool, float, float]:
-            up = self._parts.routes.state(path) is PathState.UP
-            if adaptive:
-                return not up, self._adaptive.expected_s(request, path, now), self._parts.routes.rtt(path)
-            return not up, self._records.miss_share(request.service, path, now), self._parts.routes.rtt(path)
+            return routes.state(path) is not PathState.UP, mode.slowness(self, request, path, now), routes.rtt(path)
 
         return sorted(paths, key=order)
 
     def first_look(self, request: Request, now: float) -> float | None:
         """Return when to call `look_again` for a request of which one copy was just sent, if at all."""
-        waiting = request.relied_on()
-        if not waiting or now >= request.deadline_at or not request.rule.redundancy.helps:
+        if not request.relied_on() or now >= request.deadline_at or not request.rule.redundancy.helps:
             return None
-        if request.rule.redundancy is RedundancyMode.ADAPTIVE:
-            return self._adapt(request, now)
-        half = request.submitted_at + HEDGE_AT * request.rule.deadline_s
-        if request.rule.redundancy is RedundancyMode.HEDGE:
-            path, quantile = waiting[0].path, request.rule.hedge_quantile
-            delay_s = self._records.quantile_s(request.service, path, quantile, now)
-            return half if delay_s is None else min(now + delay_s, half)
-        return half if request.rule.idempotent and len(request.asked()) == 1 else None
-
-    def _adapt(self, request: Request, now: float) -> float | None:
-        """Send the further copies that the target requires; return when to look again, None if that is pointless."""
-        while True:
-            miss = self._adaptive.miss_probability(request, now)
-            path = self._next_over_another_interface(request, now)
-            if path is None or not self._adaptive.needs(request, path, miss, now):
-                break
-            if not self._send(request, path, now, _Why.HEDGE):
-                return None  # no budget: asking again and again would only add refusals to the count
-        if path is None and now >= request.submitted_at + HEDGE_AT * request.rule.deadline_s:
-            self._ask_another_server(request, now)
-        look_at = self._adaptive.next_look(request, now)
-        return look_at if look_at < request.deadline_at else None
+        return MODES[request.rule.redundancy].first_look(self, request, now)
 
     def look_again(self, request: Request, now: float) -> float | None:
         """Look at a request at the moment named by `start` or the last call; return when to look once more."""
         if request.done or request.is_answered or not request.relied_on():
             return None
-        if request.rule.redundancy is RedundancyMode.ADAPTIVE:
-            return self._adapt(request, now)
-        self._hedge(request, now)
-        return None
+        return MODES[request.rule.redundancy].look_again(self, request, now)
 
-    def _hedge(self, request: Request, now: float) -> None:
-        """Send another copy if that promises anything.
+    def replaces_lost(self, request: Request) -> bool:
+        """Return whether a copy of it of which nothing is heard is to be replaced."""
+        return MODES[request.rule.redundancy].replaces_lost
 
-        With RedundancyMode.HEDGE it goes over another interface. Otherwise, or if there is none, it goes to another
-        server if the only one asked has the request and is silent: it may have died unnoticed. It does not go over the
-        same interface when the request has not arrived: then the path is slow, and another copy would make it worse.
-        """
-        waiting = request.relied_on()
-        if request.rule.redundancy is RedundancyMode.HEDGE:
-            path = self._next_withheld(request, now)
-            if path is not None and path.interface != waiting[0].path.interface:
-                if len(waiting) == 1:
-                    self._send(request, path, now, _Why.HEDGE)
-                return
-        self._ask_another_server(request, now)
+    def hedge(self, request: Request, path: PathId, now: float) -> bool:
+        """Send a copy because another one is slow; return whether a budget allowed it."""
+        return self._send(request, path, now, _Why.HEDGE)
 
-    def _ask_another_server(self, request: Request, now: float) -> None:
+    def ask_another_server(self, request: Request, now: float) -> None:
         """Ask another server, also over the same interface, if the only one asked has the request and is silent."""
         if request.rule.idempotent and request.waits_for_one_server():
             self.rescue(request, now, insist=True)
@@ -185,12 +146,11 @@ class Dispatching:
         if rejected and len(request.copies) >= MAX_COPIES:
             return  # its retry goes on asking, without haste
         alive = any(routes.state(copy.path) is not PathState.DOWN for copy in waiting)
-        if alive and not insist and request.rule.redundancy is RedundancyMode.ADAPTIVE:
-            self._adapt(request, now)
+        if alive and not insist and MODES[request.rule.redundancy].watches(self, request, now):
             return
         if not insist and any(routes.state(copy.path) is PathState.UP for copy in waiting):
             return
-        path = self._next_withheld(request, now) or self._elsewhere(request, now, rejected=rejected)
+        path = self.next_withheld(request, now) or self._elsewhere(request, now, rejected=rejected)
         if path is None:
             path = self._take_back(request, waiting, now)
         if path is None:
@@ -203,12 +163,13 @@ class Dispatching:
         """Return whether its server may not have all of it yet because its path is slow but not silent."""
         return not copy.message.newest.over and self._parts.routes.state(copy.path) is PathState.UP
 
-    def _next_over_another_interface(self, request: Request, now: float) -> PathId | None:
+    def next_over_another_interface(self, request: Request, now: float) -> PathId | None:
+        """Return the same, if none of the copies relied on uses its interface."""
         used = {copy.path.interface for copy in request.relied_on()}
-        path = self._next_withheld(request, now)
+        path = self.next_withheld(request, now)
         return None if path is None or path.interface in used else path
 
-    def _next_withheld(self, request: Request, now: float) -> PathId | None:
+    def next_withheld(self, request: Request, now: float) -> PathId | None:
         """Return the best mapped path that is up and carries no copy, to a server that may run it."""
         waiting = {copy.path.peer for copy in request.relied_on()}
         refused = {copy.path.peer for copy in request.copies if copy.refused}
@@ -263,7 +224,7 @@ class Dispatching:
 
     def ended(self, request: Request, now: float) -> None:
         """Note the outcome of the copies, once for each request: all are known, or the deadline is over."""
-        self._records.note(request, now)
+        self.records.note(request, now)
         if self._budgets and any(copy.in_time for copy in request.copies):
             paths = (*request.withheld, *(copy.path for copy in request.copies))
             self._budgets.earn(request.copies[0].message.total, {path.interface for path in paths})
