@@ -1,0 +1,1 @@
+"""Measures: the data plane, the control plane, the matcher, whole drives."""

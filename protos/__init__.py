@@ -1,0 +1,1 @@
+"""The contract of both planes, and what every program starts with."""

@@ -1,4 +1,4 @@
-"""Exports the Prometheus metrics of the control plane (contract names in the architecture page).
+"""Exports the Prometheus metrics of the control plane (names: docs/operate/metrics.md).
 
 The exporter serves from a thread of its own: the loop leaves finished values for it, and it never looks into the
 core. The registry is our own, without the interpreter's collectors and `_created` series, which have no base units

@@ -1,0 +1,1 @@
+"""Plans ahead from recorded paths: plr plan."""

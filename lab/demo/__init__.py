@@ -1,0 +1,1 @@
+"""Shows the product survive a link, a server and the control plane."""

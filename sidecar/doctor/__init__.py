@@ -1,0 +1,1 @@
+"""Examines a node without the control plane: plr doctor, plr ping, plr bugreport."""

@@ -1,0 +1,1 @@
+"""Serves the local socket on which a node tells of itself."""

@@ -1,0 +1,1 @@
+"""Carries ROS: the only package that imports rclpy."""

@@ -339,6 +339,13 @@ def test_architecture_names_files_that_exist() -> None:
     named = re.findall(r"`((?:sidecar|controlplane|protos|lab|bench|tests|deploy)/[\w./]+)`", read("architecture.md"))
     assert len(named) > 20
     assert [name for name in named if not (ROOT / name).exists()] == []
+    bare = set(re.findall(r"[`>\s]([a-z_]+\.py)\b", read("architecture.md")))
+    known = {
+        path.name
+        for folder in ("sidecar", "controlplane", "protos", "lab", "bench", "tests")
+        for path in (ROOT / folder).rglob("*.py")
+    }
+    assert bare - known == set()
 
 
 def test_sources_name_pages_that_exist() -> None:

@@ -1,4 +1,4 @@
-"""Cloud side: runs every request at most once here, however many copies arrive (architecture: Semantics).
+"""Cloud side: runs every request at most once here, however many copies arrive.
 
 A request is running (copies wait for its result), answered (copies get the cached answer) or forgotten: its id is
 kept as a tombstone after the answer was dropped, so that a very late copy is refused and not run again. An id is
