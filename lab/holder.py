@@ -48,7 +48,7 @@ def main(argv: list[str]) -> None:
     """Build the lab and hold it."""
     lifeline_fd = int(argv[0])
     lifeline = LineSocket(socket.socket(fileno=lifeline_fd))
-    kernel.set_process_name("netlab")
+    kernel.set_process_name("lab")
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     hello, plan = lifeline.receive(), lifeline.receive()
     if hello is None or plan is None:
@@ -148,13 +148,13 @@ class _Holder:
         kernel.unshare(_NAMESPACES)
         socket.sethostname(namespace["name"].replace("_", "-"))
         if namespace["is_host"]:
-            kernel.mount("netlab", "/dev/shm", "tmpfs", options="mode=1777")
+            kernel.mount("lab", "/dev/shm", "tmpfs", options="mode=1777")
             hosts = Path("/dev/shm/hosts")
             hosts.write_text(self._plan["hosts_file"])
             kernel.mount(str(hosts), "/etc/hosts", None, kernel.MS_BIND)
             hosts.unlink()
             with contextlib.suppress(OSError):  # only programs that read /sys/class/net miss it
-                kernel.mount("netlab", "/sys", "sysfs")
+                kernel.mount("lab", "/sys", "sysfs")
         for key, value in namespace["sysctls"].items():
             Path("/proc/sys", key).write_text(value)
         self._tell_ready()

@@ -93,7 +93,7 @@ class Lab:
         self._lifeline: LineSocket | None = None
         # The kernel sends the parent-death signal when the *thread* that started a process ends. So all are started
         # from one thread that lives as long as the lab.
-        self._spawner = ThreadPoolExecutor(1, "netlab-spawner")
+        self._spawner = ThreadPoolExecutor(1, "lab-spawner")
         self._log: IO[bytes] | None = None
         self._lifeline_lock = threading.Lock()
         self.port_kind = ""

@@ -40,6 +40,7 @@ fi
 for file in "${sources[@]}"; do
   case $file in tests/unit/test_*.py | tests/sim/test_*.py) folders[$file]=1 ;; esac
 done
+folders[tests/unit/test_layout.py]=1
 echo "quick: ${#sources[@]} changed sources, unit tests of ${#folders[@]} folders, ${#slice[@]} simulations"
 .venv/bin/python -m pytest --quiet --numprocesses "$(nproc)" --dist loadfile "${!folders[@]}" "${slice[@]}" || status=1
 exit "$status"

@@ -13,7 +13,7 @@ pytestmark = pytest.mark.netns
 REPOSITORY = Path(__file__).resolve().parents[2]
 
 
-def netlab(*arguments: str, typed: str = "") -> subprocess.CompletedProcess[str]:
+def lab_command(*arguments: str, typed: str = "") -> subprocess.CompletedProcess[str]:
     return subprocess.run(
         [sys.executable, "-S", "-m", "lab", *arguments],
         input=typed,
@@ -26,13 +26,13 @@ def netlab(*arguments: str, typed: str = "") -> subprocess.CompletedProcess[str]
 
 
 def test_help_shows_examples() -> None:
-    done = netlab("--help")
+    done = lab_command("--help")
     assert done.returncode == 0
     assert "python -m lab shell robot" in done.stdout
 
 
 def test_program_runs_on_a_host_and_gives_its_exit_code() -> None:
-    done = netlab("--link", "wlan0:delay_ms=1", "exec", "cloud_b", "--", "sh", "-c", "uname -n; exit 7")
+    done = lab_command("--link", "wlan0:delay_ms=1", "exec", "cloud_b", "--", "sh", "-c", "uname -n; exit 7")
     assert (done.stdout, done.returncode) == ("cloud-b\n", 7)
 
 
@@ -74,7 +74,7 @@ def test_typed_commands_change_the_lab_and_show_in_the_statistics(tmp_path: Path
     ],
 )
 def test_mistakes_are_told_in_one_line(arguments: tuple[str, ...], code: int, message: str) -> None:
-    done = netlab(*arguments)
+    done = lab_command(*arguments)
     assert done.returncode == code
     assert message in done.stderr
     assert done.stderr.count("\n") == 1

@@ -46,7 +46,7 @@ DOCS = ROOT / "docs"
 LISTS = {1: RevocationList(3, 0.0, 1.0, b"")}
 PAGES = sorted(
     path
-    for pattern in ("README.md", "docs/**/*.md", "deploy/**/*.md", "examples/**/*.md")
+    for pattern in ("*.md", "lab/*.md", "docs/**/*.md", "deploy/**/*.md", "examples/**/*.md")
     for path in ROOT.glob(pattern)
 )
 
