@@ -22,6 +22,7 @@ from controlplane.core.explain.departed import MAX_DEPARTED, MAX_EXPLAINED
 from controlplane.core.policy.policy import CallRule, OfferRule, Policy
 from controlplane.core.publish.history import MAX_CHANGES, MAX_HISTORIES
 from controlplane.core.publish.publisher import MAX_GONE_SNAPSHOTS
+from controlplane.core.publish.views import MAX_PERMITS_KEPT
 from controlplane.core.registry.registry import MAX_REMEMBERED_REMOVALS
 from protos.model.ids import InterfaceName, NodeName, Role, ServiceName
 from protos.model.members import RemovalReason, ServiceOffer, ServiceSet, ServiceUse
@@ -62,6 +63,7 @@ CAPPED = {
     "reached._pairs": MAX_PAIRS,
     "reached._robots_of": MAX_PAIRS,
     "reached._servers_of": MAX_PAIRS,
+    "reached._servers_of[]": MAX_PAIRS,
     "history._histories[].changes": MAX_HISTORIES * MAX_CHANGES,
     "restlessness.shares._kept": MAX_MEMBERS,
     "urgency.shares._kept": MAX_MEMBERS,
@@ -69,6 +71,9 @@ CAPPED = {
     "registry._shares.shares._kept": MAX_MEMBERS,
     "registry._removals": MAX_REMEMBERED_REMOVALS,
     "_publisher._gone": MAX_GONE_SNAPSHOTS,
+    # Those made under the permits before: none until the policy changes for the first time.
+    "_publisher._known_peers._former": MAX_MEMBERS,
+    "_publisher._known_peers._former[]": MAX_MEMBERS * MAX_PERMITS_KEPT,
     "estimator._compute._servers": MAX_PROCESSING,
 }
 """Tables that remember departed members, with their caps."""
