@@ -14,13 +14,13 @@ from setuptools.command.build_py import build_py
 from setuptools.command.sdist import sdist
 
 ROOT = Path(__file__).resolve().parent
-COMMIT = runpy.run_path(str(ROOT / "protos" / "program" / "commit.py"))
+COMMIT = runpy.run_path(str(ROOT / "plr" / "protos" / "program" / "commit.py"))
 
 
 def stamp(folder: Path) -> None:
     """Leave the commit beside the module that reads it."""
     commit = COMMIT["commit"]()
-    file = folder / "protos" / "program" / COMMIT["STAMP"]
+    file = folder / "plr" / "protos" / "program" / COMMIT["STAMP"]
     # A source distribution may have made it a hard link to the one that it came with.
     file.unlink(missing_ok=True)
     if commit is not None:

@@ -34,19 +34,19 @@ from rclpy.serialization import deserialize_message, serialize_message
 from rclpy.type_support import check_for_type_support
 from std_srvs.srv import Empty
 
-from protos.model.ids import NodeName, Role, ServiceName, SessionId
-from protos.program import interpreter
-from sidecar.core.base.values import ExecutionId, Priority
-from sidecar.core.rules.service_rule import ServiceRule
-from sidecar.core.seam.application import ExecuteRequest, OfferService, RequestFailed, ResponseArrived
-from sidecar.ros import rcl
+from plr.protos.model.ids import NodeName, Role, ServiceName, SessionId
+from plr.protos.program import interpreter
+from plr.sidecar.core.base.values import ExecutionId, Priority
+from plr.sidecar.core.rules.service_rule import ServiceRule
+from plr.sidecar.core.seam.application import ExecuteRequest, OfferService, RequestFailed, ResponseArrived
+from plr.sidecar.ros import rcl
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
 
-    from protos.model.members import ServiceOffer
-    from sidecar.core.base.values import RejectReason, RequestId
-    from sidecar.ros.bridge import RosBridge
+    from plr.protos.model.members import ServiceOffer
+    from plr.sidecar.core.base.values import RejectReason, RequestId
+    from plr.sidecar.ros.bridge import RosBridge
 
 CALLED_SERVICES = 4
 """Services that the caller calls in rotation; the others are only present."""
@@ -202,7 +202,7 @@ class Shortcut:
 
 def run_bridges(services: int) -> None:
     """Proxy ROS_DOMAIN_ID's services into the next domain."""
-    from sidecar.ros.bridge import RosBridge
+    from plr.sidecar.ros.bridge import RosBridge
 
     interpreter.share()
     rules = (ServiceRule("/s*", deadline_s=1.0, lifetime_s=CALL_TIMEOUT_S),)

@@ -16,24 +16,24 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from bench.null_cipher import null_cipher
-from protos.model.ids import InterfaceId, InterfaceName, NodeName, Role, ServiceName, Version
-from protos.model.members import ALL_CALLS, Candidate, CandidateKind, Peer, PeerSet, ServiceOffer
-from protos.trust.clock_floor import ClockFloor
-from protos.trust.pair_token import pair_token
-from sidecar.core.base.values import RequestId
-from sidecar.core.engine.engine import Engine, EngineConfig
-from sidecar.core.link.link import Link
-from sidecar.core.link.sender import LinkIdentity
-from sidecar.core.rules.service_rule import ServiceRule
-from sidecar.core.seam.application import ExecuteRequest, RequestFailed, ResponseArrived
-from sidecar.core.seam.links import SetReady
-from sidecar.core.wire.frame import BASE_SYMBOL_BYTES, symbol_count
-from sidecar.state.start_session import start_session
+from plr.protos.model.ids import InterfaceId, InterfaceName, NodeName, Role, ServiceName, Version
+from plr.protos.model.members import ALL_CALLS, Candidate, CandidateKind, Peer, PeerSet, ServiceOffer
+from plr.protos.trust.clock_floor import ClockFloor
+from plr.protos.trust.pair_token import pair_token
+from plr.sidecar.core.base.values import RequestId
+from plr.sidecar.core.engine.engine import Engine, EngineConfig
+from plr.sidecar.core.link.link import Link
+from plr.sidecar.core.link.sender import LinkIdentity
+from plr.sidecar.core.rules.service_rule import ServiceRule
+from plr.sidecar.core.seam.application import ExecuteRequest, RequestFailed, ResponseArrived
+from plr.sidecar.core.seam.links import SetReady
+from plr.sidecar.core.wire.frame import BASE_SYMBOL_BYTES, symbol_count
+from plr.sidecar.state.start_session import start_session
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from sidecar.core.link.sender import Batch
+    from plr.sidecar.core.link.sender import Batch
 
 SERVICE = ServiceName("/bench")
 TYPE = "bench/srv/Bytes"

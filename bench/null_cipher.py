@@ -9,15 +9,15 @@ from __future__ import annotations
 import contextlib
 from typing import TYPE_CHECKING
 
-from sidecar.core.crypto import aead
+from plr.sidecar.core.crypto import aead
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
     from cryptography.utils import Buffer
 
-    from protos.trust.credential import Aead
-    from sidecar.core.crypto.aead import Cipher
+    from plr.protos.trust.credential import Aead
+    from plr.sidecar.core.crypto.aead import Cipher
 
 
 class NullCipher:

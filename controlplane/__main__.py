@@ -21,25 +21,25 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from protos.program import endings, extras, interpreter
+from plr.protos.program import endings, extras, interpreter
 
 with extras.required("plr-controlplane", "controlplane"):
-    from controlplane.config.controlplane import load_config, refuse_exposed
-    from controlplane.serve.certificate_watch import load_own_files
-    from protos.base.errors import ConfigError
-    from protos.base.printable import escaped
-    from protos.program.arguments import OneLineParser
-    from protos.program.certificate_term import term_problem
-    from protos.program.log_lines import line_formatter
-    from protos.program.logging_setup import Logging
-    from protos.program.version_option import ShowVersion, describe
+    from plr.controlplane.config.controlplane import load_config, refuse_exposed
+    from plr.controlplane.serve.certificate_watch import load_own_files
+    from plr.protos.base.errors import ConfigError
+    from plr.protos.base.printable import escaped
+    from plr.protos.program.arguments import OneLineParser
+    from plr.protos.program.certificate_term import term_problem
+    from plr.protos.program.log_lines import line_formatter
+    from plr.protos.program.logging_setup import Logging
+    from plr.protos.program.version_option import ShowVersion, describe
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from controlplane.config.controlplane import ControlPlaneConfig
-    from controlplane.serve.server import Addresses
-    from protos.program.tls_files import TlsFiles
+    from plr.controlplane.config.controlplane import ControlPlaneConfig
+    from plr.controlplane.serve.server import Addresses
+    from plr.protos.program.tls_files import TlsFiles
 
 EXIT_OK = 0
 EXIT_FAILED = 1
@@ -50,7 +50,7 @@ _NO_STUN_SERVERS = (
     "own configuration names one"
 )
 
-log = logging.getLogger("controlplane")
+log = logging.getLogger("plr.controlplane")
 
 
 @endings.ends_quietly("plr-controlplane")
@@ -80,7 +80,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         return EXIT_OK
     logging.getLogger("grpc._cython.cygrpc").addFilter(_is_not_a_lost_stream)
     # Write the log off the loop's thread: a stopped terminal would otherwise stop the whole fleet's control plane.
-    logs = Logging("controlplane", config.log_level, sys.stderr, line_formatter(sys.stderr))
+    logs = Logging("plr.controlplane", config.log_level, sys.stderr, line_formatter(sys.stderr, "plr"))
     with logs:
         if problem is not None:
             # Start all the same: the clock is set soon after boot, and a replaced certificate is read again.
@@ -92,7 +92,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def _warn_of_what_is_legal(config: ControlPlaneConfig) -> None:
     """Print what a start would log as warnings: a policy that allows nothing is legal, and locks a fleet out."""
-    from controlplane.config.policy_reload import doubt
+    from plr.controlplane.config.policy_reload import doubt
 
     warnings = [None if config.policy is None else doubt(config.policy.policy())]
     warnings.append(_NO_STUN_SERVERS if config.stun_listen and not config.stun_servers else None)
@@ -103,7 +103,7 @@ def _warn_of_what_is_legal(config: ControlPlaneConfig) -> None:
 def _serve(source: Path, config: ControlPlaneConfig, files: TlsFiles | None) -> int:
     _take_descriptors()
     # Importing gRPC takes half a second; checking a configuration need not wait for that.
-    from controlplane.serve.server import StartError
+    from plr.controlplane.serve.server import StartError
 
     try:
         asyncio.run(_run(source, config, files))
@@ -148,9 +148,9 @@ def _is_not_a_lost_stream(record: logging.LogRecord) -> bool:
 
 
 async def _run(source: Path, config: ControlPlaneConfig, files: TlsFiles | None) -> None:
-    from controlplane.config.policy_reload import PolicyReload
-    from controlplane.serve.server import serve
-    from protos.program.notifier import Notifier
+    from plr.controlplane.config.policy_reload import PolicyReload
+    from plr.controlplane.serve.server import serve
+    from plr.protos.program.notifier import Notifier
 
     interpreter.share()
     stop = asyncio.Event()

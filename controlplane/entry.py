@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from protos.program.entry import end_by_ctrl_c
+from plr.protos.program.entry import end_by_ctrl_c
 
 
 def main() -> int:
     """Run the program and return its exit code."""
     end_by_ctrl_c()
-    from controlplane.__main__ import main
+    from plr.controlplane.__main__ import main
 
     return main()

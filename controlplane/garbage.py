@@ -10,7 +10,7 @@ from __future__ import annotations
 import resource
 from pathlib import Path
 
-from protos.program import interpreter
+from plr.protos.program import interpreter
 
 SET_ASIDE_EVERY_S = 0.1
 """Interval between brief collections: a fleet of 1,000 creates some thousand objects in it, a millisecond of work."""

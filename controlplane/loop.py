@@ -10,8 +10,8 @@ from collections import Counter
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from controlplane.core.control.control import ControlCore, Settled
-from controlplane.core.control.events import (
+from plr.controlplane.core.control.control import ControlCore, Settled
+from plr.controlplane.core.control.events import (
     CutOffNotice,
     DepartureNotice,
     NackNotice,
@@ -19,46 +19,46 @@ from controlplane.core.control.events import (
     StreamLostNotice,
     UnmetNotice,
 )
-from controlplane.core.overload.line_share import LineShare
-from controlplane.core.overload.report_share import ReportShares
-from controlplane.core.policy.policy import OfferRule
-from controlplane.core.problem.plan import Plan
-from controlplane.core.problem.problem import Problem
-from controlplane.core.publish.messages import Close, CloseReason, Send
-from controlplane.core.registry.credential_check import check_claims, check_unproven_claims
-from controlplane.core.registry.registry import Refusal
-from controlplane.garbage import Collector
-from controlplane.observe.fleet_metrics import MAX_GONE, Fleet
-from controlplane.observe.remembered import departures
-from controlplane.serve.earliest_end import EarliestEnd
-from controlplane.serve.mailbox import Mailbox
-from controlplane.turns import Turns
-from protos.base.token_bucket import TokenBucket
-from protos.convert import status_to_proto
-from protos.model.fleet_events import EventKind
-from protos.model.ids import Role
-from protos.model.members import NO_REVOCATIONS, RemovalReason
-from protos.trust.identity import EXPIRED, REVOKED, CertificateError
+from plr.controlplane.core.overload.line_share import LineShare
+from plr.controlplane.core.overload.report_share import ReportShares
+from plr.controlplane.core.policy.policy import OfferRule
+from plr.controlplane.core.problem.plan import Plan
+from plr.controlplane.core.problem.problem import Problem
+from plr.controlplane.core.publish.messages import Close, CloseReason, Send
+from plr.controlplane.core.registry.credential_check import check_claims, check_unproven_claims
+from plr.controlplane.core.registry.registry import Refusal
+from plr.controlplane.garbage import Collector
+from plr.controlplane.observe.fleet_metrics import MAX_GONE, Fleet
+from plr.controlplane.observe.remembered import departures
+from plr.controlplane.serve.earliest_end import EarliestEnd
+from plr.controlplane.serve.mailbox import Mailbox
+from plr.controlplane.turns import Turns
+from plr.protos.base.token_bucket import TokenBucket
+from plr.protos.convert import status_to_proto
+from plr.protos.model.fleet_events import EventKind
+from plr.protos.model.ids import Role
+from plr.protos.model.members import NO_REVOCATIONS, RemovalReason
+from plr.protos.trust.identity import EXPIRED, REVOKED, CertificateError
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
-    from controlplane.config.controlplane import ControlPlaneConfig
-    from controlplane.core.explain.departed import Departed
-    from controlplane.core.explain.fleet_view import MemberView
-    from controlplane.core.formulation.block import Picture
-    from controlplane.core.policy.policy import Policy
-    from controlplane.core.registry.registry import StreamId
-    from controlplane.observe.event_log import EventLog
-    from controlplane.observe.metrics import Metrics
-    from controlplane.serve.stun_server import StunServer
-    from controlplane.serve.tls_gate import Caller
-    from controlplane.solver.matcher import Matcher
-    from protos.model.explanation import Explanation
-    from protos.model.ids import NodeName, ServiceName
-    from protos.model.members import Registration, RevocationSet
-    from protos.model.stream import SidecarMessage
-    from protos.trust.identity import Trust
+    from plr.controlplane.config.controlplane import ControlPlaneConfig
+    from plr.controlplane.core.explain.departed import Departed
+    from plr.controlplane.core.explain.fleet_view import MemberView
+    from plr.controlplane.core.formulation.block import Picture
+    from plr.controlplane.core.policy.policy import Policy
+    from plr.controlplane.core.registry.registry import StreamId
+    from plr.controlplane.observe.event_log import EventLog
+    from plr.controlplane.observe.metrics import Metrics
+    from plr.controlplane.serve.stun_server import StunServer
+    from plr.controlplane.serve.tls_gate import Caller
+    from plr.controlplane.solver.matcher import Matcher
+    from plr.protos.model.explanation import Explanation
+    from plr.protos.model.ids import NodeName, ServiceName
+    from plr.protos.model.members import Registration, RevocationSet
+    from plr.protos.model.stream import SidecarMessage
+    from plr.protos.trust.identity import Trust
 
 log = logging.getLogger(__name__)
 
@@ -130,12 +130,12 @@ class _LateMatcher:
     @staticmethod
     def prepare() -> None:
         """Import the modules that few problems need."""
-        from controlplane.solver import cp_sat
+        from plr.controlplane.solver import cp_sat
 
         cp_sat.prepare()
 
     def solve(self, problem: Problem, time_limit_s: float, hint: Plan) -> Plan:
-        from controlplane.solver.matcher import Matcher
+        from plr.controlplane.solver.matcher import Matcher
 
         if self._matcher is None:
             self._matcher = Matcher()

@@ -7,8 +7,8 @@ from dataclasses import asdict, dataclass
 from enum import StrEnum
 from typing import TYPE_CHECKING, Any
 
-from controlplane.planning.traces import DEFAULT_QUEUE_BYTES
 from lab.errors import LabConfigError
+from plr.controlplane.planning.traces import DEFAULT_QUEUE_BYTES
 
 if TYPE_CHECKING:
     from collections.abc import Mapping

@@ -17,17 +17,17 @@ from typing import TYPE_CHECKING, Any
 import yaml
 from google.protobuf import json_format
 
-from controlplane.ca import Authority
-from protos.convert import explanation_from_proto
-from protos.plr.v1 import admin_pb2
-from protos.trust.identity import IdentityRole
+from plr.controlplane.ca import Authority
+from plr.protos.convert import explanation_from_proto
+from plr.protos.plr.v1 import admin_pb2
+from plr.protos.trust.identity import IdentityRole
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
     from pathlib import Path
 
     from lab import Host, HostProcess, Lab
-    from protos.model.explanation import Explanation
+    from plr.protos.model.explanation import Explanation
 
 CONTROL_PORT = 50051
 STUN_PORT = 3478
@@ -88,10 +88,10 @@ class System:
             "metrics_listen": f"127.0.0.1:{CONTROL_METRICS_PORT}",
             **changes,
         }
-        return self._start("controlplane", host, "controlplane", self._write("controlplane", config))
+        return self._start("controlplane", host, "plr.controlplane", self._write("controlplane", config))
 
     def start_cloud(
-        self, name: str, services: Sequence[dict[str, Any]], *, module: str = "sidecar", **changes: Any
+        self, name: str, services: Sequence[dict[str, Any]], *, module: str = "plr.sidecar", **changes: Any
     ) -> Part:
         """Start a cloud's sidecar (or its replacement); `services` as in its configuration."""
         config = {
@@ -116,7 +116,7 @@ class System:
         interfaces: Sequence[str] = ("wlan0", "wwan0"),
         domain: int = 0,
         metrics_port: int = METRICS_PORT,
-        module: str = "sidecar",
+        module: str = "plr.sidecar",
         **changes: Any,
     ) -> Part:
         """Start a robot's sidecar (or its replacement) in a ROS domain of its host."""
@@ -201,7 +201,7 @@ class System:
         argv = [
             sys.executable,
             "-m",
-            "controlplane.cli",
+            "plr.controlplane.cli",
             "explain",
             robot,
             service,

@@ -1,4 +1,4 @@
-"""Turns recorded paths into steps of the lab's links; `controlplane.planning.traces` defines the file format."""
+"""Turns recorded paths into steps of the lab's links; `plr.controlplane.planning.traces` defines the file format."""
 
 from __future__ import annotations
 
@@ -6,12 +6,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from controlplane.planning import traces
 from lab.errors import LabConfigError
 from lab.profile import LinkProfile
+from plr.controlplane.planning import traces
 
 if TYPE_CHECKING:
-    from controlplane.planning.traces import Direction, RecordedPaths
+    from plr.controlplane.planning.traces import Direction, RecordedPaths
 
 
 @dataclass(frozen=True, slots=True)

@@ -15,28 +15,28 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from protos.program import commit, endings, extras
+from plr.protos.program import commit, endings, extras
 
 with extras.required("plr-sidecar", "sidecar"):
-    from protos.base.errors import ConfigError, StartError
-    from protos.base.printable import escaped
-    from protos.model.ids import Role
-    from protos.program.arguments import OneLineParser
-    from protos.program.certificate_term import term_problem
-    from protos.program.log_lines import line_formatter
-    from protos.program.logging_setup import Logging
-    from protos.program.tls_files import load_tls_files
-    from protos.program.version_option import ShowVersion
-    from sidecar.config.sidecar import SidecarConfig, config_schema, load_config, refuse_exposed
-    from sidecar.ros import environment
-    from sidecar.stop_request import StopRequest
+    from plr.protos.base.errors import ConfigError, StartError
+    from plr.protos.base.printable import escaped
+    from plr.protos.model.ids import Role
+    from plr.protos.program.arguments import OneLineParser
+    from plr.protos.program.certificate_term import term_problem
+    from plr.protos.program.log_lines import line_formatter
+    from plr.protos.program.logging_setup import Logging
+    from plr.protos.program.tls_files import load_tls_files
+    from plr.protos.program.version_option import ShowVersion
+    from plr.sidecar.config.sidecar import SidecarConfig, config_schema, load_config, refuse_exposed
+    from plr.sidecar.ros import environment
+    from plr.sidecar.stop_request import StopRequest
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from protos.program.certificate_term import TermProblem
+    from plr.protos.program.certificate_term import TermProblem
 
-log = logging.getLogger("sidecar.main")
+log = logging.getLogger("plr.sidecar.main")
 
 PROGRAM = "plr-sidecar"
 EXIT_OK = 0
@@ -118,7 +118,7 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _warn_of_missing_interfaces(config: SidecarConfig) -> None:
-    from sidecar.net.interfaces import list_interfaces, missing_interfaces
+    from plr.sidecar.net.interfaces import list_interfaces, missing_interfaces
 
     described = [network.interface for network in config.networks]
     for line in missing_interfaces(list_interfaces(), config.interfaces, described):
@@ -141,8 +141,8 @@ def _check_ros(*, thorough: bool) -> None:
 def _warn_of_missing_types(config: SidecarConfig) -> None:
     if config.role is not Role.ROBOT:
         return  # the type of a local server is only known when it runs
-    from sidecar.ros.graph.known_types import missing_types
-    from sidecar.state.store import peek_last_good
+    from plr.sidecar.ros.graph.known_types import missing_types
+    from plr.sidecar.state.store import peek_last_good
 
     peers = peek_last_good(config.state_dir, config.node_name).peers
     for line in missing_types(peers.peers if peers is not None else (), config.service_rules()):
@@ -170,7 +170,7 @@ def _run(config: SidecarConfig) -> int:
     # gRPC's own lines on stderr have another format, and our log says the same.
     os.environ.setdefault("GRPC_VERBOSITY", "ERROR")
     stop = StopRequest()
-    logs = Logging("sidecar", config.log_level.value, sys.stderr, line_formatter(sys.stderr, "sidecar"))
+    logs = Logging("plr.sidecar", config.log_level.value, sys.stderr, line_formatter(sys.stderr, "plr.sidecar"))
     with logs:
         failure = _stop_on_signals_and_crashes(stop)
         try:
@@ -181,7 +181,7 @@ def _run(config: SidecarConfig) -> int:
             # Imported late, as it takes a second, several on a busy machine: a wrong configuration has been reported by
             # now, and signals are handled meanwhile.
             try:
-                from sidecar.runtime import run
+                from plr.sidecar.runtime import run
             except ImportError:
                 # The first check cannot see this: rclpy is there, but one of its libraries is missing.
                 _check_ros(thorough=True)

@@ -7,10 +7,10 @@ from typing import TYPE_CHECKING, Protocol
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from protos.model.ids import ServiceName, SessionId
-    from protos.model.members import ServiceOffer
-    from sidecar.core.base.values import ExecutionId, RejectReason, RequestId
-    from sidecar.core.seam.application import ApplicationEvent
+    from plr.protos.model.ids import ServiceName, SessionId
+    from plr.protos.model.members import ServiceOffer
+    from plr.sidecar.core.base.values import ExecutionId, RejectReason, RequestId
+    from plr.sidecar.core.seam.application import ApplicationEvent
 
 
 class DataPlane(Protocol):

@@ -10,48 +10,48 @@ import time
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
-from protos.base.errors import StartError
-from protos.base.host_port import split_host_port
-from protos.model.ids import OLDEST_PROTOCOL_VERSION, PROTOCOL_VERSION, Role, ServiceName, Version
-from protos.model.members import MAX_UNMET, CandidateKind, Registration, ServiceSet
-from protos.model.stream import ResourceKind
-from protos.program import interpreter
-from protos.program.notifier import Notifier
-from protos.program.tls_files import TlsWatch, load_tls_files
-from protos.trust.clock_floor import ClockFloor
-from sidecar.control.announcement import Announcer
-from sidecar.control.client import ControlClient
-from sidecar.control.revocations import Revocations
-from sidecar.core.control.session import Apply, ControlSession
-from sidecar.core.control.ways import ControlInterface
-from sidecar.core.engine.engine import EngineConfig
-from sidecar.local.server import LocalServer, LocalSocketError
-from sidecar.local.state import LocalState, MappingOrigin
-from sidecar.net.control_dialer import ControlDialer
-from sidecar.net.dataplane import DataPlaneHooks, ThreadedDataPlane
-from sidecar.net.interface_manager import InterfaceManager
-from sidecar.observe.metrics import MetricSources, serve_metrics
-from sidecar.observe.unmet_services import UnmetServices, told, told_mismatched, told_unreached
-from sidecar.ros.bridge import RosBridge
-from sidecar.state.start_session import signed, start_session
-from sidecar.state.store import StateDirError, StateStore
+from plr.protos.base.errors import StartError
+from plr.protos.base.host_port import split_host_port
+from plr.protos.model.ids import OLDEST_PROTOCOL_VERSION, PROTOCOL_VERSION, Role, ServiceName, Version
+from plr.protos.model.members import MAX_UNMET, CandidateKind, Registration, ServiceSet
+from plr.protos.model.stream import ResourceKind
+from plr.protos.program import interpreter
+from plr.protos.program.notifier import Notifier
+from plr.protos.program.tls_files import TlsWatch, load_tls_files
+from plr.protos.trust.clock_floor import ClockFloor
+from plr.sidecar.control.announcement import Announcer
+from plr.sidecar.control.client import ControlClient
+from plr.sidecar.control.revocations import Revocations
+from plr.sidecar.core.control.session import Apply, ControlSession
+from plr.sidecar.core.control.ways import ControlInterface
+from plr.sidecar.core.engine.engine import EngineConfig
+from plr.sidecar.local.server import LocalServer, LocalSocketError
+from plr.sidecar.local.state import LocalState, MappingOrigin
+from plr.sidecar.net.control_dialer import ControlDialer
+from plr.sidecar.net.dataplane import DataPlaneHooks, ThreadedDataPlane
+from plr.sidecar.net.interface_manager import InterfaceManager
+from plr.sidecar.observe.metrics import MetricSources, serve_metrics
+from plr.sidecar.observe.unmet_services import UnmetServices, told, told_mismatched, told_unreached
+from plr.sidecar.ros.bridge import RosBridge
+from plr.sidecar.state.start_session import signed, start_session
+from plr.sidecar.state.store import StateDirError, StateStore
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from protos.model.ids import InterfaceName, NodeName
-    from protos.model.mapping import Assignment, MappingSet
-    from protos.model.members import Candidate, PeerSet
-    from protos.model.report import Report
-    from protos.model.stream import Welcome
-    from protos.program.metrics_server import MetricsServer
-    from protos.program.tls_files import TlsFiles
-    from sidecar.config.sidecar import SidecarConfig
-    from sidecar.core.base.report_scope import ReportScope
-    from sidecar.core.base.values import PathState
-    from sidecar.core.link.pinging import Pong
-    from sidecar.core.stun.events import StunEvent
-    from sidecar.stop_request import StopRequest
+    from plr.protos.model.ids import InterfaceName, NodeName
+    from plr.protos.model.mapping import Assignment, MappingSet
+    from plr.protos.model.members import Candidate, PeerSet
+    from plr.protos.model.report import Report
+    from plr.protos.model.stream import Welcome
+    from plr.protos.program.metrics_server import MetricsServer
+    from plr.protos.program.tls_files import TlsFiles
+    from plr.sidecar.config.sidecar import SidecarConfig
+    from plr.sidecar.core.base.report_scope import ReportScope
+    from plr.sidecar.core.base.values import PathState
+    from plr.sidecar.core.link.pinging import Pong
+    from plr.sidecar.core.stun.events import StunEvent
+    from plr.sidecar.stop_request import StopRequest
 
 log = logging.getLogger(__name__)
 

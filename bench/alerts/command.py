@@ -20,9 +20,9 @@ from bench.alerts.monitoring import Monitoring, MonitoringError, Ports
 from bench.control.crowd import Crowd
 from bench.control.member import SERVICE, Member
 from bench.control.plane import Plane
-from controlplane.ca import Authority
-from protos.model.ids import InterfaceName, NodeName, Role
-from protos.trust.identity import IdentityRole
+from plr.controlplane.ca import Authority
+from plr.protos.model.ids import InterfaceName, NodeName, Role
+from plr.protos.trust.identity import IdentityRole
 
 if TYPE_CHECKING:
     import argparse

@@ -16,13 +16,13 @@ from typing import TYPE_CHECKING
 
 import grpc
 
-from controlplane.core.overload.pacing import Pacing
-from protos.convert import control_message_to_proto, parse_sidecar_message
-from protos.model.ids import InterfaceName, NodeName, Role, ServiceName, Version
-from protos.model.mapping import Assignment, MappingSet, ServiceMapping
-from protos.model.members import PeerSet, Registration
-from protos.model.stream import Welcome
-from protos.plr.v1 import control_pb2
+from plr.controlplane.core.overload.pacing import Pacing
+from plr.protos.convert import control_message_to_proto, parse_sidecar_message
+from plr.protos.model.ids import InterfaceName, NodeName, Role, ServiceName, Version
+from plr.protos.model.mapping import Assignment, MappingSet, ServiceMapping
+from plr.protos.model.members import PeerSet, Registration
+from plr.protos.model.stream import Welcome
+from plr.protos.plr.v1 import control_pb2
 
 if TYPE_CHECKING:
     Context = grpc.aio.ServicerContext[bytes, bytes]

@@ -22,9 +22,9 @@ from bench.control.targets import SIZES, targets
 from bench.pressure import CpuPressure
 from bench.reporting.machine import machine
 from bench.reporting.terminal import show_verdicts
-from controlplane.ca import Authority
-from protos.model.ids import NodeName, Role
-from protos.trust.identity import IdentityRole
+from plr.controlplane.ca import Authority
+from plr.protos.model.ids import NodeName, Role
+from plr.protos.trust.identity import IdentityRole
 
 if TYPE_CHECKING:
     import argparse

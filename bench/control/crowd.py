@@ -14,23 +14,23 @@ from typing import TYPE_CHECKING
 
 import grpc
 
-from protos.convert import control_message_from_proto, sidecar_message_to_proto
-from protos.model.ids import Role
-from protos.model.mapping import MappingSet
-from protos.plr.v1 import control_pb2_grpc
-from protos.trust.identity import CONTROL_PLANE_DNS
-from sidecar.control.channel import REFUSALS
-from sidecar.core.base.report_scope import ReportScope
-from sidecar.core.control.session import Apply, ControlState
+from plr.protos.convert import control_message_from_proto, sidecar_message_to_proto
+from plr.protos.model.ids import Role
+from plr.protos.model.mapping import MappingSet
+from plr.protos.plr.v1 import control_pb2_grpc
+from plr.protos.trust.identity import CONTROL_PLANE_DNS
+from plr.sidecar.control.channel import REFUSALS
+from plr.sidecar.core.base.report_scope import ReportScope
+from plr.sidecar.core.control.session import Apply, ControlState
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
     from bench.control.member import Member
-    from protos.model.ids import NodeName
-    from protos.model.members import PeerSet
-    from protos.plr.v1 import control_pb2
-    from sidecar.core.control.session import ControlSession
+    from plr.protos.model.ids import NodeName
+    from plr.protos.model.members import PeerSet
+    from plr.protos.plr.v1 import control_pb2
+    from plr.sidecar.core.control.session import ControlSession
 
     Call = grpc.aio.StreamStreamCall[control_pb2.SidecarMessage, control_pb2.ControlMessage]
 

@@ -6,9 +6,9 @@ import hashlib
 import time
 from typing import TYPE_CHECKING
 
-from protos.base.histogram import Histogram
-from protos.model.ids import PROTOCOL_VERSION, InterfaceId, InterfaceName, NodeName, Role, ServiceName
-from protos.model.members import (
+from plr.protos.base.histogram import Histogram
+from plr.protos.model.ids import PROTOCOL_VERSION, InterfaceId, InterfaceName, NodeName, Role, ServiceName
+from plr.protos.model.members import (
     Candidate,
     CandidateKind,
     CandidateSet,
@@ -17,17 +17,17 @@ from protos.model.members import (
     ServiceSet,
     ServiceUse,
 )
-from protos.model.report import LatencyReport, OutcomeReport, PathReport, Report
-from protos.trust.candidate_signature import sign_candidates
-from protos.trust.credential import Aead, SessionCredential, session_number
-from sidecar.core.control.session import ControlSession
+from plr.protos.model.report import LatencyReport, OutcomeReport, PathReport, Report
+from plr.protos.trust.candidate_signature import sign_candidates
+from plr.protos.trust.credential import Aead, SessionCredential, session_number
+from plr.sidecar.core.control.session import ControlSession
 
 if TYPE_CHECKING:
     import random
 
-    from controlplane.ca.certificates import Issued
-    from protos.model.ids import SessionId
-    from protos.model.mapping import Assignment
+    from plr.controlplane.ca.certificates import Issued
+    from plr.protos.model.ids import SessionId
+    from plr.protos.model.mapping import Assignment
 
 SERVICE = ServiceName("/plan_path")
 TYPE = "bench/srv/Plan"

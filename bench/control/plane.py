@@ -19,10 +19,10 @@ import yaml
 
 from bench.churn.machine import processor_s
 from lab.host import DIE_WITH_PARENT
-from protos.trust.identity import IdentityRole
+from plr.protos.trust.identity import IdentityRole
 
 if TYPE_CHECKING:
-    from controlplane.ca import Authority
+    from plr.controlplane.ca import Authority
 
 UNIT = Path("deploy/systemd/plr-controlplane.service")
 USUAL_OPEN_FILES = 1024
@@ -148,7 +148,7 @@ class Plane:
 
     def status_s(self) -> float:
         """Return how long `plr status` takes, from start to end."""
-        command = [sys.executable, "-m", "controlplane.cli", "status", "--address", self.target]
+        command = [sys.executable, "-m", "plr.controlplane.cli", "status", "--address", self.target]
         began = time.monotonic()
         subprocess.run(
             [*command, "--tls-dir", str(self._operator)], check=True, stdout=subprocess.DEVNULL, timeout=PATIENCE_S

@@ -17,7 +17,7 @@ import time
 from pathlib import Path
 from typing import Any
 
-from controlplane.__main__ import main as controlplane_main
+from plr.controlplane.__main__ import main as controlplane_main
 
 KEPT = 20
 NOTED_FROM_S = 0.002

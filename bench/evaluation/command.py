@@ -25,7 +25,7 @@ from bench.reporting.machine import machine
 from bench.reporting.terminal import rich_table
 from lab import LabConfigError
 from lab.trace_folder import read_folder
-from protos.base.errors import ConfigError
+from plr.protos.base.errors import ConfigError
 
 if TYPE_CHECKING:
     import argparse

@@ -12,7 +12,7 @@ from bench.evaluation.measured import Measured
 from bench.evaluation.outcome import Outcome, by_window, figures_by_window
 from bench.evaluation.redundancy_costs import mode_costs
 from bench.evaluation.studies import is_recorded
-from protos.model.explanation import Correlation
+from plr.protos.model.explanation import Correlation
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

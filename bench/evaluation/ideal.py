@@ -1,7 +1,7 @@
 """Computes from the trace what two first-in-first-out paths would have achieved; nothing is run.
 
-Each path is first in, first out in both directions (`controlplane.planning.fifo`) and carries every request; the ideal
-takes, for each request, the faster of the two. It neither cancels losing copies nor splits a request, so it is no
+Each path is first in, first out in both directions (`plr.controlplane.planning.fifo`) and carries every request; the
+ideal takes, for each request, the faster of the two. It neither cancels losing copies nor splits a request, so it is no
 bound: a system that does can be better where a queue builds up. `bench.evaluation.oracle` is closer to a bound.
 """
 
@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 
 from bench.dataplane.calling import Compute
 from bench.evaluation.outcome import Outcome, Request
-from controlplane.planning.fifo import FifoPath
+from plr.controlplane.planning.fifo import FifoPath
 
 if TYPE_CHECKING:
     from bench.evaluation.scenario import Scenario

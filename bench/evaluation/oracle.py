@@ -14,13 +14,13 @@ from typing import TYPE_CHECKING
 
 from bench.evaluation.ideal import ORACLE
 from bench.evaluation.outcome import Outcome, Request
-from controlplane.planning.fifo import FifoLink
+from plr.controlplane.planning.fifo import FifoLink
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from bench.evaluation.scenario import Scenario, Traffic
-    from controlplane.planning.fifo import Step
+    from plr.controlplane.planning.fifo import Step
 
 OVERHEAD = 1.05
 """Bytes of IP packets for each byte of a request."""

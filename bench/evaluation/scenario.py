@@ -20,7 +20,7 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validat
 from bench.evaluation.generator import generate
 from bench.evaluation.kinds import KINDS
 from bench.evaluation.windows import Window, choose
-from protos.program.config_file import parse_yaml, read_text, validate
+from plr.protos.program.config_file import parse_yaml, read_text, validate
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence

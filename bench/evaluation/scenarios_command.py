@@ -16,7 +16,7 @@ from bench.reporting.tables import Figure, Table
 from bench.reporting.terminal import rich_table
 from lab import LabConfigError
 from lab.trace_folder import TraceEntry, read_folder
-from protos.base.errors import ConfigError
+from plr.protos.base.errors import ConfigError
 
 if TYPE_CHECKING:
     import argparse

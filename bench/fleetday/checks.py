@@ -11,22 +11,22 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from protos.model.ids import Role, Version
-from protos.model.members import NO_CALLS
-from protos.model.status import SyncState
-from protos.model.stream import ResourceKind
-from protos.trust.pair_token import pair_token
+from plr.protos.model.ids import Role, Version
+from plr.protos.model.members import NO_CALLS
+from plr.protos.model.status import SyncState
+from plr.protos.model.stream import ResourceKind
+from plr.protos.trust.pair_token import pair_token
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from bench.fleetday.member import Member
     from bench.fleetday.plane import Plane
-    from controlplane.core.control.control import ControlCore
-    from controlplane.core.policy.policy import Policy
-    from protos.model.ids import NodeName
-    from protos.model.mapping import ServiceMapping
-    from protos.model.members import Peer
+    from plr.controlplane.core.control.control import ControlCore
+    from plr.controlplane.core.policy.policy import Policy
+    from plr.protos.model.ids import NodeName
+    from plr.protos.model.mapping import ServiceMapping
+    from plr.protos.model.members import Peer
 
 SETTLES_S = 60.0
 """Time after a change of a member, or of its reachability, until all that can learn of the change have: twice the

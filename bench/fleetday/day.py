@@ -14,24 +14,24 @@ from bench.fleetday.member import Measurements, Member
 from bench.fleetday.plane import Plane
 from bench.fleetday.sizes import Sizes, grown, measure
 from bench.fleetday.timeline import Timeline
-from controlplane.core.base.member_table import MAX_MEMBERS
-from controlplane.core.control.events import Settings
-from controlplane.core.estimate.processing import MAX_PROCESSING
-from controlplane.core.estimate.reached import MAX_PAIRS
-from controlplane.core.explain.departed import MAX_DEPARTED, MAX_EXPLAINED
-from controlplane.core.policy.policy import CallRule, OfferRule, Policy
-from controlplane.core.publish.history import MAX_CHANGES, MAX_HISTORIES
-from controlplane.core.publish.publisher import MAX_GONE_SNAPSHOTS
-from controlplane.core.publish.views import MAX_PERMITS_KEPT
-from controlplane.core.registry.registry import MAX_REMEMBERED_REMOVALS
-from protos.model.ids import InterfaceName, NodeName, Role, ServiceName
-from protos.model.members import RemovalReason, ServiceOffer, ServiceSet, ServiceUse
+from plr.controlplane.core.base.member_table import MAX_MEMBERS
+from plr.controlplane.core.control.events import Settings
+from plr.controlplane.core.estimate.processing import MAX_PROCESSING
+from plr.controlplane.core.estimate.reached import MAX_PAIRS
+from plr.controlplane.core.explain.departed import MAX_DEPARTED, MAX_EXPLAINED
+from plr.controlplane.core.policy.policy import CallRule, OfferRule, Policy
+from plr.controlplane.core.publish.history import MAX_CHANGES, MAX_HISTORIES
+from plr.controlplane.core.publish.publisher import MAX_GONE_SNAPSHOTS
+from plr.controlplane.core.publish.views import MAX_PERMITS_KEPT
+from plr.controlplane.core.registry.registry import MAX_REMEMBERED_REMOVALS
+from plr.protos.model.ids import InterfaceName, NodeName, Role, ServiceName
+from plr.protos.model.members import RemovalReason, ServiceOffer, ServiceSet, ServiceUse
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
     from pathlib import Path
 
-    from protos.model.ids import Address
+    from plr.protos.model.ids import Address
 
 HOUR_S = 3600.0
 START = 1000.0

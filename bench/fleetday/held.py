@@ -7,14 +7,14 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from protos.model.ids import Version
+from plr.protos.model.ids import Version
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from protos.model.ids import NodeName
-    from protos.model.mapping import ServiceMapping
-    from protos.model.members import Peer, PeerSet
+    from plr.protos.model.ids import NodeName
+    from plr.protos.model.mapping import ServiceMapping
+    from plr.protos.model.members import Peer, PeerSet
 
 
 class HeldPeers:

@@ -5,17 +5,17 @@ from __future__ import annotations
 from functools import partial
 from typing import TYPE_CHECKING
 
-from controlplane.core.publish.messages import CloseReason
-from controlplane.core.registry.registry import Refusal
-from controlplane.serve.mailbox import Mailbox
-from protos.convert import (
+from plr.controlplane.core.publish.messages import CloseReason
+from plr.controlplane.core.registry.registry import Refusal
+from plr.controlplane.serve.mailbox import Mailbox
+from plr.protos.convert import (
     control_message_to_proto,
     parse_control_message,
     parse_sidecar_message,
     sidecar_message_to_proto,
 )
-from protos.model.members import PeerSet, Registration
-from protos.model.stream import Heartbeat
+from plr.protos.model.members import PeerSet, Registration
+from plr.protos.model.stream import Heartbeat
 
 if TYPE_CHECKING:
     import random
@@ -23,8 +23,8 @@ if TYPE_CHECKING:
     from bench.fleetday.member import Member
     from bench.fleetday.plane import Plane
     from bench.fleetday.timeline import Timeline
-    from controlplane.core.registry.registry import StreamId
-    from protos.model.stream import ControlMessage, SidecarMessage
+    from plr.controlplane.core.registry.registry import StreamId
+    from plr.protos.model.stream import ControlMessage, SidecarMessage
 
 IN_FLIGHT = 2
 """Messages that a connection's buffers hold; the others wait in the mailbox, where newer ones replace older ones."""

@@ -7,22 +7,22 @@ from typing import TYPE_CHECKING
 
 from bench.fleetday.held import Held
 from bench.fleetday.line import Line
-from protos.base.histogram import Histogram
-from protos.model.ids import PROTOCOL_VERSION, InterfaceId, InterfaceName, Role, SessionId, Version
-from protos.model.members import Candidate, CandidateKind, CandidateSet, PeerSet, Registration, ServiceSet
-from protos.model.report import LatencyReport, OutcomeReport, PathReport, Report
-from protos.model.stream import ResourceKind, Welcome
-from sidecar.core.base.report_scope import ReportScope
-from sidecar.core.control.session import Apply, ControlSession, ControlState
+from plr.protos.base.histogram import Histogram
+from plr.protos.model.ids import PROTOCOL_VERSION, InterfaceId, InterfaceName, Role, SessionId, Version
+from plr.protos.model.members import Candidate, CandidateKind, CandidateSet, PeerSet, Registration, ServiceSet
+from plr.protos.model.report import LatencyReport, OutcomeReport, PathReport, Report
+from plr.protos.model.stream import ResourceKind, Welcome
+from plr.sidecar.core.base.report_scope import ReportScope
+from plr.sidecar.core.control.session import Apply, ControlSession, ControlState
 
 if TYPE_CHECKING:
     import random
 
     from bench.fleetday.plane import Plane
     from bench.fleetday.timeline import Timeline
-    from protos.model.ids import Address, InterfaceName, NodeName
-    from protos.model.mapping import MappingSet
-    from protos.model.stream import ControlMessage
+    from plr.protos.model.ids import Address, InterfaceName, NodeName
+    from plr.protos.model.mapping import MappingSet
+    from plr.protos.model.stream import ControlMessage
 
 NOTICES_S = (10.0, 40.0)
 """Range of the time in which keepalives find a connection that died silently."""

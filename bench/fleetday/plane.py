@@ -6,8 +6,8 @@ import dataclasses
 from functools import partial
 from typing import TYPE_CHECKING
 
-from controlplane.core.control.control import ControlCore
-from controlplane.core.control.events import (
+from plr.controlplane.core.control.control import ControlCore
+from plr.controlplane.core.control.events import (
     CutOffNotice,
     DepartureNotice,
     NackNotice,
@@ -15,12 +15,12 @@ from controlplane.core.control.events import (
     StreamLostNotice,
     UnmetNotice,
 )
-from controlplane.core.publish.messages import Close, CloseReason, Send
-from controlplane.core.registry.registry import Refusal
-from controlplane.observe.event_log import EventLog
-from controlplane.observe.remembered import departures
-from controlplane.solver.matcher import Matcher
-from protos.model.fleet_events import EventKind
+from plr.controlplane.core.publish.messages import Close, CloseReason, Send
+from plr.controlplane.core.registry.registry import Refusal
+from plr.controlplane.observe.event_log import EventLog
+from plr.controlplane.observe.remembered import departures
+from plr.controlplane.solver.matcher import Matcher
+from plr.protos.model.fleet_events import EventKind
 
 if TYPE_CHECKING:
     import random
@@ -28,14 +28,14 @@ if TYPE_CHECKING:
 
     from bench.fleetday.line import Line
     from bench.fleetday.timeline import Timeline
-    from controlplane.core.control.events import Settings
-    from controlplane.core.formulation.block import Picture
-    from controlplane.core.policy.policy import Policy
-    from controlplane.core.problem.plan import Plan
-    from controlplane.core.registry.registry import StreamId
-    from protos.model.ids import NodeName
-    from protos.model.members import Registration, RemovalReason
-    from protos.model.stream import Heartbeat, SidecarMessage
+    from plr.controlplane.core.control.events import Settings
+    from plr.controlplane.core.formulation.block import Picture
+    from plr.controlplane.core.policy.policy import Policy
+    from plr.controlplane.core.problem.plan import Plan
+    from plr.controlplane.core.registry.registry import StreamId
+    from plr.protos.model.ids import NodeName
+    from plr.protos.model.members import Registration, RemovalReason
+    from plr.protos.model.stream import Heartbeat, SidecarMessage
 
 TURN_S = 0.02
 """Minimum interval between turns of the loop that follow each other."""

@@ -16,7 +16,7 @@ from bench.reporting.machine import machine
 from bench.reporting.tables import Table
 from bench.reporting.terminal import rich_table
 from lab.attacker.hostile_link import spoofed
-from sidecar.core.link.path_table import UNPROVEN_BYTES, UNPROVEN_BYTES_PER_S
+from plr.sidecar.core.link.path_table import UNPROVEN_BYTES, UNPROVEN_BYTES_PER_S
 
 if TYPE_CHECKING:
     from pathlib import Path

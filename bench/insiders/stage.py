@@ -17,7 +17,7 @@ from lab import Lab, LabConfig, LinkProfile, robot, server
 from lab.attacker.orders import ORDERS, TALLY, Orders
 from lab.attacker.wire import Tap
 from lab.system import CONTROL_METRICS_PORT, CONTROL_PORT, METRICS_PORT, System, read_json
-from protos.trust.identity import IdentityRole
+from plr.protos.trust.identity import IdentityRole
 
 if TYPE_CHECKING:
     from lab import HostSpec

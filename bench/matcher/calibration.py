@@ -13,8 +13,8 @@ from scipy.stats import beta
 
 from bench.matcher.feed import PAIRS, REPORT_INTERVAL_S, ROBOT, SERVICE, Reporter
 from bench.matcher.races import ANSWER_BYTES
-from controlplane.core.estimate.estimator import Estimator
-from controlplane.core.estimate.posterior import Estimate
+from plr.controlplane.core.estimate.estimator import Estimator
+from plr.controlplane.core.estimate.posterior import Estimate
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence

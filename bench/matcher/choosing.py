@@ -10,16 +10,16 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from bench.matcher.feed import PAIRS, REPORT_INTERVAL_S, ROBOT, SERVICE
-from controlplane.core.problem.plan import Plan, make_plan
-from controlplane.core.problem.problem import Block, BlockKey, Objective, Problem
-from controlplane.core.settle.stability import Stability
+from plr.controlplane.core.problem.plan import Plan, make_plan
+from plr.controlplane.core.problem.problem import Block, BlockKey, Objective, Problem
+from plr.controlplane.core.settle.stability import Stability
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from bench.matcher.calibration import Arrays
     from bench.matcher.races import Races
-    from controlplane.core.problem.problem import Choice
+    from plr.controlplane.core.problem.problem import Choice
 
 RIVALS = ("best fixed", "random", "round robin", "lowest mean RTT")
 RTT_MEMORY = 0.98

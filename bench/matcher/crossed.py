@@ -19,9 +19,9 @@ from bench.matcher.races import (
     Race,
     Races,
 )
-from controlplane.planning.fifo import FifoLink
-from protos.model.ids import InterfaceName, NodeName
-from protos.model.mapping import Assignment
+from plr.controlplane.planning.fifo import FifoLink
+from plr.protos.model.ids import InterfaceName, NodeName
+from plr.protos.model.mapping import Assignment
 
 if TYPE_CHECKING:
     from bench.matcher.races import Workload

@@ -7,14 +7,14 @@ import time
 from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
-from controlplane.core.control.control import ControlCore
-from controlplane.core.control.events import Settings
-from controlplane.core.publish.messages import Send
-from controlplane.solver.matcher import Matcher
-from protos.base.histogram import Histogram
-from protos.model.ids import PROTOCOL_VERSION, InterfaceId, InterfaceName, NodeName, Role, ServiceName, SessionId
-from protos.model.mapping import Assignment, MappingSet
-from protos.model.members import (
+from plr.controlplane.core.control.control import ControlCore
+from plr.controlplane.core.control.events import Settings
+from plr.controlplane.core.publish.messages import Send
+from plr.controlplane.solver.matcher import Matcher
+from plr.protos.base.histogram import Histogram
+from plr.protos.model.ids import PROTOCOL_VERSION, InterfaceId, InterfaceName, NodeName, Role, ServiceName, SessionId
+from plr.protos.model.mapping import Assignment, MappingSet
+from plr.protos.model.members import (
     Candidate,
     CandidateKind,
     CandidateSet,
@@ -23,12 +23,12 @@ from protos.model.members import (
     ServiceSet,
     ServiceUse,
 )
-from protos.model.report import JointReport, LatencyReport, OutcomeReport, PathReport, Report
+from plr.protos.model.report import JointReport, LatencyReport, OutcomeReport, PathReport, Report
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterator
 
-    from controlplane.core.registry.registry import StreamId
+    from plr.controlplane.core.registry.registry import StreamId
 
 SERVICE = ServiceName("/bench")
 TYPE = "nav_msgs/srv/GetPlan"

@@ -9,12 +9,12 @@ from collections import Counter
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from protos.base.histogram import Histogram
-from protos.base.size_class import size_class
-from protos.model.ids import InterfaceName, NodeName, ServiceName
-from protos.model.mapping import Assignment
-from protos.model.report import JointReport, LatencyReport, PathReport, Report
-from sidecar.core.base.request_id import OBSERVED_ONE_IN
+from plr.protos.base.histogram import Histogram
+from plr.protos.base.size_class import size_class
+from plr.protos.model.ids import InterfaceName, NodeName, ServiceName
+from plr.protos.model.mapping import Assignment
+from plr.protos.model.report import JointReport, LatencyReport, PathReport, Report
+from plr.sidecar.core.base.request_id import OBSERVED_ONE_IN
 
 if TYPE_CHECKING:
     import random

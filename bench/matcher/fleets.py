@@ -13,9 +13,9 @@ from typing import Any
 import numpy as np
 from ortools.graph.python import min_cost_flow
 
-from controlplane.core.problem.objectives import epsilon_matrix, path_costs
-from controlplane.core.problem.problem import Block, BlockKey, FleetKey, Objective, Path, Problem
-from protos.model.ids import InterfaceName, NodeName, ServiceName
+from plr.controlplane.core.problem.objectives import epsilon_matrix, path_costs
+from plr.controlplane.core.problem.problem import Block, BlockKey, FleetKey, Objective, Path, Problem
+from plr.protos.model.ids import InterfaceName, NodeName, ServiceName
 
 SERVICE = ServiceName("/bench")
 ROOM = 1.1

@@ -17,15 +17,15 @@ from bench.dataplane.section import Findings
 from bench.reporting.tables import Figure, Table
 from lab import Lab, LabConfig, LinkProfile
 from lab.system import System, read_json
-from protos.base.errors import DecodeError
-from protos.model.ids import NodeName
-from sidecar.state.file import decode_last_good
-from sidecar.state.store import LAST_GOOD_FILE
+from plr.protos.base.errors import DecodeError
+from plr.protos.model.ids import NodeName
+from plr.sidecar.state.file import decode_last_good
+from plr.sidecar.state.store import LAST_GOOD_FILE
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from protos.model.explanation import Explanation
+    from plr.protos.model.explanation import Explanation
 
 SERVICE = "/echo"
 CLOUDS = ("cloud_a", "cloud_b", "cloud_c")

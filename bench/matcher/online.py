@@ -20,15 +20,15 @@ from bench.matcher.crossed import pairs_of
 from bench.matcher.feed import REPORT_INTERVAL_S, Reporter
 from bench.matcher.plane import Plane
 from bench.matcher.races import ANSWER_BYTES, PATHS
-from sidecar.config.service import DEFAULT_EXPLORATION
-from sidecar.core.base.request_id import OBSERVED_ONE_IN
-from sidecar.core.robot.dispatch.exploration import ExplorationBudget
+from plr.sidecar.config.service import DEFAULT_EXPLORATION
+from plr.sidecar.core.base.request_id import OBSERVED_ONE_IN
+from plr.sidecar.core.robot.dispatch.exploration import ExplorationBudget
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
     from bench.matcher.races import Races
-    from protos.model.mapping import Assignment, ServiceMapping
+    from plr.protos.model.mapping import Assignment, ServiceMapping
 
 RIVALS = ("best fixed", "random", "round robin", "lowest mean RTT")
 Mapping = tuple[int, ...]

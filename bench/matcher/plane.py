@@ -6,14 +6,14 @@ import zlib
 from typing import TYPE_CHECKING
 
 from bench.matcher.feed import REPORT_INTERVAL_S, ROBOT, SERVICE
-from controlplane.core.control.control import ControlCore
-from controlplane.core.control.events import Settings
-from controlplane.core.publish.messages import Send
-from controlplane.core.registry.registry import Refusal
-from controlplane.solver.matcher import Matcher
-from protos.model.ids import PROTOCOL_VERSION, InterfaceId, InterfaceName, Role, SessionId
-from protos.model.mapping import MappingSet, ServiceMapping
-from protos.model.members import (
+from plr.controlplane.core.control.control import ControlCore
+from plr.controlplane.core.control.events import Settings
+from plr.controlplane.core.publish.messages import Send
+from plr.controlplane.core.registry.registry import Refusal
+from plr.controlplane.solver.matcher import Matcher
+from plr.protos.model.ids import PROTOCOL_VERSION, InterfaceId, InterfaceName, Role, SessionId
+from plr.protos.model.mapping import MappingSet, ServiceMapping
+from plr.protos.model.members import (
     Candidate,
     CandidateKind,
     CandidateSet,
@@ -26,10 +26,10 @@ from protos.model.members import (
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from controlplane.core.registry.registry import StreamId
-    from protos.model.ids import NodeName
-    from protos.model.mapping import Assignment
-    from protos.model.stream import SidecarMessage
+    from plr.controlplane.core.registry.registry import StreamId
+    from plr.protos.model.ids import NodeName
+    from plr.protos.model.mapping import Assignment
+    from plr.protos.model.stream import SidecarMessage
 
 FOREVER_S = 1e9
 JOINED_S = -2.0

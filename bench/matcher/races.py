@@ -7,7 +7,7 @@ import zlib
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from controlplane.planning.fifo import FifoPath
+from plr.controlplane.planning.fifo import FifoPath
 
 if TYPE_CHECKING:
     from lab.traces import Trace

@@ -14,17 +14,17 @@ from bench.dataplane.section import Findings
 from bench.matcher.crowd import Crowd
 from bench.matcher.fleets import ROOM, flow_optimum, in_regions, random_fleet
 from bench.reporting.tables import Figure, Table
-from controlplane.config.controlplane import ControlPlaneConfig
-from controlplane.core.control.schedule import URGENT_DELAY_S
-from controlplane.core.problem.plan import relative_gap
-from controlplane.core.problem.problem import Objective
-from controlplane.solver.matcher import Matcher
-from protos.base.histogram import Histogram
+from plr.controlplane.config.controlplane import ControlPlaneConfig
+from plr.controlplane.core.control.schedule import URGENT_DELAY_S
+from plr.controlplane.core.problem.plan import relative_gap
+from plr.controlplane.core.problem.problem import Objective
+from plr.controlplane.solver.matcher import Matcher
+from plr.protos.base.histogram import Histogram
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from controlplane.core.problem.problem import Problem
+    from plr.controlplane.core.problem.problem import Problem
 
 OVERLOAD_ROOM = 0.9
 """Capacity of the servers over the demand."""

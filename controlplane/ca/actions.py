@@ -13,15 +13,15 @@ from typing import TYPE_CHECKING
 from cryptography import x509
 from cryptography.x509.oid import NameOID
 
-from controlplane.ca import listing
-from controlplane.ca.authority import Authority, AuthorityError
-from controlplane.ca.files import refuse_planted, write_tls_files
-from controlplane.ca.folder import AuthorityFolder, Protection
-from controlplane.ca.passphrase import NEW_VARIABLE, VARIABLE, PassphraseSource
-from protos.base.errors import ConfigError
-from protos.base.printable import escaped
-from protos.program.regular_file import read_regular
-from protos.program.tls_files import (
+from plr.controlplane.ca import listing
+from plr.controlplane.ca.authority import Authority, AuthorityError
+from plr.controlplane.ca.files import refuse_planted, write_tls_files
+from plr.controlplane.ca.folder import AuthorityFolder, Protection
+from plr.controlplane.ca.passphrase import NEW_VARIABLE, VARIABLE, PassphraseSource
+from plr.protos.base.errors import ConfigError
+from plr.protos.base.printable import escaped
+from plr.protos.program.regular_file import read_regular
+from plr.protos.program.tls_files import (
     CA_FILE,
     CERTIFICATE_FILE,
     CRL_FILE,
@@ -31,7 +31,7 @@ from protos.program.tls_files import (
     load_private_key,
     read_guarded,
 )
-from protos.trust.identity import IdentityRole
+from plr.protos.trust.identity import IdentityRole
 
 if TYPE_CHECKING:
     import argparse

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 from cryptography import x509
 from cryptography.hazmat.primitives.serialization import Encoding
 
-from controlplane.ca.certificates import (
+from plr.controlplane.ca.certificates import (
     Issued,
     Validity,
     build_authority,
@@ -18,11 +18,11 @@ from controlplane.ca.certificates import (
     build_revocation_list,
     generate_key,
 )
-from controlplane.ca.files import write_tls_files
-from controlplane.ca.index import Entry, Record
-from controlplane.ca.request import fingerprint
-from protos.model.names import node_name
-from protos.trust.identity import MAX_CA_CERTIFICATES
+from plr.controlplane.ca.files import write_tls_files
+from plr.controlplane.ca.index import Entry, Record
+from plr.controlplane.ca.request import fingerprint
+from plr.protos.model.names import node_name
+from plr.protos.trust.identity import MAX_CA_CERTIFICATES
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
@@ -30,8 +30,8 @@ if TYPE_CHECKING:
 
     from cryptography.hazmat.primitives.asymmetric import ec
 
-    from controlplane.ca.request import Request
-    from protos.trust.identity import IdentityRole
+    from plr.controlplane.ca.request import Request
+    from plr.protos.trust.identity import IdentityRole
 
 DAY_S = 86_400.0
 

@@ -1,7 +1,7 @@
 """Builds the X.509 structures that a CA signs: its own certificate, those of nodes, and its revocation list.
 
 Signatures are deterministic (RFC 6979): the safety of the CA's key does not depend on good randomness in every
-signature, and an unchanged revocation list has the same bytes. `protos.trust.identity` checks what is built here.
+signature, and an unchanged revocation list has the same bytes. `plr.protos.trust.identity` checks what is built here.
 """
 
 from __future__ import annotations
@@ -16,8 +16,8 @@ from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.hazmat.primitives.serialization import Encoding
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
-from controlplane.ca.key_file import clear_pem
-from protos.trust.identity import CONTROL_PLANE_DNS, IdentityRole, identity_uri
+from plr.controlplane.ca.key_file import clear_pem
+from plr.protos.trust.identity import CONTROL_PLANE_DNS, IdentityRole, identity_uri
 
 if TYPE_CHECKING:
     from collections.abc import Iterable

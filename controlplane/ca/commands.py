@@ -9,20 +9,20 @@ from typing import TYPE_CHECKING
 
 from cryptography.x509 import ReasonFlags
 
-from controlplane.ca import actions, request_actions
-from controlplane.ca.authority import DEFAULT_CA_DAYS, DEFAULT_DAYS, AuthorityError
-from controlplane.ca.passphrase import NEW_VARIABLE, VARIABLE
-from protos.base.errors import ConfigError, DecodeError
-from protos.base.printable import escaped
-from protos.model.names import node_name, text
-from protos.program import endings
-from protos.program.arguments import checked
-from protos.trust.identity import IdentityRole
+from plr.controlplane.ca import actions, request_actions
+from plr.controlplane.ca.authority import DEFAULT_CA_DAYS, DEFAULT_DAYS, AuthorityError
+from plr.controlplane.ca.passphrase import NEW_VARIABLE, VARIABLE
+from plr.protos.base.errors import ConfigError, DecodeError
+from plr.protos.base.printable import escaped
+from plr.protos.model.names import node_name, text
+from plr.protos.program import endings
+from plr.protos.program.arguments import checked
+from plr.protos.trust.identity import IdentityRole
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from protos.program.arguments import Commands
+    from plr.protos.program.arguments import Commands
 
 EXIT_OK = 0
 EXIT_FAILED = 1

@@ -9,12 +9,12 @@ import stat
 import tempfile
 from typing import TYPE_CHECKING
 
-from protos.program.tls_files import CA_FILE, CERTIFICATE_FILE, CRL_FILE, KEY_FILE
+from plr.protos.program.tls_files import CA_FILE, CERTIFICATE_FILE, CRL_FILE, KEY_FILE
 
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from controlplane.ca.certificates import Issued
+    from plr.controlplane.ca.certificates import Issued
 
 PRIVATE_FOLDER = 0o700
 PRIVATE_FILE = 0o600

@@ -21,14 +21,14 @@ from typing import TYPE_CHECKING
 
 from cryptography import x509
 
-from controlplane.ca.authority import Authority
-from controlplane.ca.certificates import Issued
-from controlplane.ca.files import PRIVATE_FILE, PRIVATE_FOLDER, PUBLIC_FILE, write_atomically
-from controlplane.ca.index import decode_index, encode_index
-from controlplane.ca.key_file import clear_pem, encrypted_pem, is_encrypted, is_well_encrypted
-from protos.base.errors import ConfigError
-from protos.program.regular_file import read_regular
-from protos.program.tls_files import CA_FILE, CERTIFICATE_FILE, CRL_FILE, KEY_FILE, load_private_key, read_guarded
+from plr.controlplane.ca.authority import Authority
+from plr.controlplane.ca.certificates import Issued
+from plr.controlplane.ca.files import PRIVATE_FILE, PRIVATE_FOLDER, PUBLIC_FILE, write_atomically
+from plr.controlplane.ca.index import decode_index, encode_index
+from plr.controlplane.ca.key_file import clear_pem, encrypted_pem, is_encrypted, is_well_encrypted
+from plr.protos.base.errors import ConfigError
+from plr.protos.program.regular_file import read_regular
+from plr.protos.program.tls_files import CA_FILE, CERTIFICATE_FILE, CRL_FILE, KEY_FILE, load_private_key, read_guarded
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping
@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 
     from cryptography.hazmat.primitives.asymmetric import ec
 
-    from controlplane.ca.index import Record
+    from plr.controlplane.ca.index import Record
 
 INDEX_FILE = "index.json"
 AUTHORITIES = "authorities"

@@ -17,16 +17,16 @@ from pydantic import (
     model_validator,
 )
 
-from protos.base.errors import ConfigError
-from protos.model.names import node_name
-from protos.program.config_file import key_path
-from protos.trust.identity import IdentityRole
+from plr.protos.base.errors import ConfigError
+from plr.protos.model.names import node_name
+from plr.protos.program.config_file import key_path
+from plr.protos.trust.identity import IdentityRole
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
     from pathlib import Path
 
-    from protos.model.ids import NodeName
+    from plr.protos.model.ids import NodeName
 
 
 LAST_MOMENT = 253_402_300_799.0

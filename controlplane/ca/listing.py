@@ -12,7 +12,7 @@ if TYPE_CHECKING:
 
     from cryptography import x509
 
-    from controlplane.ca.index import Entry, Record
+    from plr.controlplane.ca.index import Entry, Record
 
 _HEADER = ("NAME", "ROLE", "SERIAL", "VALID UNTIL", "DAYS LEFT", "STATE")
 _DAY_S = 86_400.0

@@ -11,8 +11,8 @@ import sys
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from protos.base.errors import ConfigError
-from protos.program.tls_files import read_guarded
+from plr.protos.base.errors import ConfigError
+from plr.protos.program.tls_files import read_guarded
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -22,13 +22,13 @@ from cryptography.hazmat.primitives.asymmetric import ec, rsa
 from cryptography.hazmat.primitives.serialization import Encoding, PublicFormat
 from cryptography.x509.oid import NameOID
 
-from controlplane.ca.certificates import alternative_names
-from protos.base.errors import DecodeError
-from protos.trust.identity import SIGNATURES, name_and_role
+from plr.controlplane.ca.certificates import alternative_names
+from plr.protos.base.errors import DecodeError
+from plr.protos.trust.identity import SIGNATURES, name_and_role
 
 if TYPE_CHECKING:
-    from protos.model.ids import NodeName
-    from protos.trust.identity import IdentityRole
+    from plr.protos.model.ids import NodeName
+    from plr.protos.trust.identity import IdentityRole
 
 REQUEST_FILE = "request.pem"
 

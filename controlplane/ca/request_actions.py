@@ -8,27 +8,27 @@ from typing import TYPE_CHECKING
 from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.hazmat.primitives.serialization import Encoding
 
-from controlplane.ca import listing
-from controlplane.ca.actions import kept_key, opened, refuse_taken, save
-from controlplane.ca.authority import AuthorityError
-from controlplane.ca.certificates import generate_key
-from controlplane.ca.files import PRIVATE_FILE, PUBLIC_FILE, make_private, write_atomically, write_certificate
-from controlplane.ca.folder import AuthorityFolder
-from controlplane.ca.key_file import clear_pem
-from controlplane.ca.request import MAX_REQUEST_BYTES, REQUEST_FILE, build_request, fingerprint, parse_request
-from protos.base.errors import ConfigError, DecodeError
-from protos.base.printable import escaped
-from protos.program.regular_file import read_regular
-from protos.program.tls_files import KEY_FILE
-from protos.trust.identity import IdentityRole
+from plr.controlplane.ca import listing
+from plr.controlplane.ca.actions import kept_key, opened, refuse_taken, save
+from plr.controlplane.ca.authority import AuthorityError
+from plr.controlplane.ca.certificates import generate_key
+from plr.controlplane.ca.files import PRIVATE_FILE, PUBLIC_FILE, make_private, write_atomically, write_certificate
+from plr.controlplane.ca.folder import AuthorityFolder
+from plr.controlplane.ca.key_file import clear_pem
+from plr.controlplane.ca.request import MAX_REQUEST_BYTES, REQUEST_FILE, build_request, fingerprint, parse_request
+from plr.protos.base.errors import ConfigError, DecodeError
+from plr.protos.base.printable import escaped
+from plr.protos.program.regular_file import read_regular
+from plr.protos.program.tls_files import KEY_FILE
+from plr.protos.trust.identity import IdentityRole
 
 if TYPE_CHECKING:
     import argparse
     from collections.abc import Iterable
     from pathlib import Path
 
-    from controlplane.ca.index import Record
-    from controlplane.ca.request import Request
+    from plr.controlplane.ca.index import Record
+    from plr.controlplane.ca.request import Request
 
 _MAY = {
     IdentityRole.ROBOT: "may call services",

@@ -26,14 +26,14 @@ import argparse
 import sys
 from typing import TYPE_CHECKING
 
-from protos.program import extras
-from protos.program.arguments import OneLineParser
-from protos.program.version_option import ShowVersion
+from plr.protos.program import extras
+from plr.protos.program.arguments import OneLineParser
+from plr.protos.program.version_option import ShowVersion
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
-    from protos.program.arguments import Commands
+    from plr.protos.program.arguments import Commands
 
 # Each command imports what it needs only when it is called: `plr status` is used where each second counts, and the
 # imports of all commands together take longer than its answer.
@@ -73,49 +73,49 @@ def _parser(asked_for: str) -> argparse.ArgumentParser:
 
 
 def _status(commands: Commands, summary: str) -> None:
-    from controlplane.cli import status_command
+    from plr.controlplane.cli import status_command
 
     status_command.add_to(commands, summary)
 
 
 def _explain(commands: Commands, summary: str) -> None:
-    from controlplane.cli import explain_command
+    from plr.controlplane.cli import explain_command
 
     explain_command.add_to(commands, summary)
 
 
 def _events(commands: Commands, summary: str) -> None:
-    from controlplane.cli import events_command
+    from plr.controlplane.cli import events_command
 
     events_command.add_to(commands, summary)
 
 
 def _plan(commands: Commands, summary: str) -> None:
-    from controlplane.cli import plan_command
+    from plr.controlplane.cli import plan_command
 
     plan_command.add_to(commands, summary)
 
 
 def _ca(commands: Commands, summary: str) -> None:
-    from controlplane.ca import commands as ca_commands
+    from plr.controlplane.ca import commands as ca_commands
 
     ca_commands.add_ca(commands, summary)
 
 
 def _request(commands: Commands, summary: str) -> None:
-    from controlplane.ca import commands as ca_commands
+    from plr.controlplane.ca import commands as ca_commands
 
     ca_commands.add_request(commands, summary)
 
 
 def _config(commands: Commands, summary: str) -> None:
-    from controlplane.cli import config_command
+    from plr.controlplane.cli import config_command
 
     config_command.add_to(commands, summary)
 
 
 def _policy(commands: Commands, summary: str) -> None:
-    from controlplane.cli import policy_command
+    from plr.controlplane.cli import policy_command
 
     policy_command.add_to(commands, summary)
 
@@ -138,7 +138,7 @@ _ON_A_NODE = {
     "ping": "on a robot or a server: how long each path to a peer takes",
     "bugreport": "on a robot or a server: a tar file for whoever helps",
 }
-"""The sidecar's commands, which never come here (`protos.program.command_line`): listed, and suggested after a typo."""
+"""The sidecar's commands, which `plr.protos.program.command_line` takes: listed, and suggested after a typo."""
 
 
 if __name__ == "__main__":

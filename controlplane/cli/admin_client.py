@@ -9,19 +9,19 @@ from typing import TYPE_CHECKING, TypeVar
 
 import grpc
 
-from protos.base.errors import ConfigError, DecodeError
-from protos.base.host_port import check_remote
-from protos.base.printable import escaped
-from protos.plr.v1 import admin_pb2_grpc
-from protos.program import tls_advice
-from protos.program.arguments import number
-from protos.program.tls_files import load_tls_files
-from protos.trust.identity import CONTROL_PLANE_DNS
+from plr.protos.base.errors import ConfigError, DecodeError
+from plr.protos.base.host_port import check_remote
+from plr.protos.base.printable import escaped
+from plr.protos.plr.v1 import admin_pb2_grpc
+from plr.protos.program import tls_advice
+from plr.protos.program.arguments import number
+from plr.protos.program.tls_files import load_tls_files
+from plr.protos.trust.identity import CONTROL_PLANE_DNS
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from protos.program.tls_files import TlsFiles
+    from plr.protos.program.tls_files import TlsFiles
 
 A = TypeVar("A")
 

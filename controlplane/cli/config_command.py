@@ -7,12 +7,12 @@ import subprocess
 import sys
 from typing import TYPE_CHECKING
 
-from controlplane.config.controlplane import ControlPlaneConfig
+from plr.controlplane.config.controlplane import ControlPlaneConfig
 
 if TYPE_CHECKING:
     import argparse
 
-    from protos.program.arguments import Commands
+    from plr.protos.program.arguments import Commands
 
 EXIT_OK = 0
 
@@ -29,6 +29,6 @@ def add_to(commands: Commands, summary: str) -> None:
 def _schema(arguments: argparse.Namespace) -> int:
     if arguments.program == "sidecar":
         # The planes do not import each other: ask the program that has these keys.
-        return subprocess.run([sys.executable, "-m", "sidecar", "--print-schema"], check=False).returncode
+        return subprocess.run([sys.executable, "-m", "plr.sidecar", "--print-schema"], check=False).returncode
     sys.stdout.write(json.dumps(ControlPlaneConfig.model_json_schema(), indent=2) + "\n")
     return EXIT_OK

@@ -5,13 +5,13 @@ from __future__ import annotations
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING
 
-from controlplane.cli.text_table import columns, listed
-from protos.model.fleet_events import EventLogState, Why
+from plr.controlplane.cli.text_table import columns, listed
+from plr.protos.model.fleet_events import EventLogState, Why
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
-    from protos.model.fleet_events import DepartedSidecar, FleetEvent
+    from plr.protos.model.fleet_events import DepartedSidecar, FleetEvent
 
 SHOWN = 20
 """Departed sidecars shown in the text of a status."""

@@ -10,17 +10,17 @@ from dataclasses import replace
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING
 
-from controlplane.cli import event_text
-from controlplane.cli.admin_client import AskError, add_options, ask
-from controlplane.observe import event_lines
-from protos.convert import event_list_from_proto, event_query_to_proto
-from protos.model.fleet_events import EventQuery
-from protos.model.names import node_name
-from protos.program.arguments import checked, whole
+from plr.controlplane.cli import event_text
+from plr.controlplane.cli.admin_client import AskError, add_options, ask
+from plr.controlplane.observe import event_lines
+from plr.protos.convert import event_list_from_proto, event_query_to_proto
+from plr.protos.model.fleet_events import EventQuery
+from plr.protos.model.names import node_name
+from plr.protos.program.arguments import checked, whole
 
 if TYPE_CHECKING:
-    from protos.model.fleet_events import EventList
-    from protos.program.arguments import Commands
+    from plr.protos.model.fleet_events import EventList
+    from plr.protos.program.arguments import Commands
 
 EXIT_OK = 0
 

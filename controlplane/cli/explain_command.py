@@ -6,17 +6,17 @@ import argparse
 import sys
 from typing import TYPE_CHECKING
 
-from controlplane.cli import explanation_text
-from controlplane.cli.admin_client import AskError, add_options, ask
-from protos.convert import explanation_from_proto
-from protos.model.names import node_name, service_name
-from protos.plr.v1 import admin_pb2
-from protos.program.arguments import checked
+from plr.controlplane.cli import explanation_text
+from plr.controlplane.cli.admin_client import AskError, add_options, ask
+from plr.protos.convert import explanation_from_proto
+from plr.protos.model.names import node_name, service_name
+from plr.protos.plr.v1 import admin_pb2
+from plr.protos.program.arguments import checked
 
 if TYPE_CHECKING:
-    from protos.model.explanation import Explanation
-    from protos.plr.v1 import admin_pb2_grpc
-    from protos.program.arguments import Commands
+    from plr.protos.model.explanation import Explanation
+    from plr.protos.plr.v1 import admin_pb2_grpc
+    from plr.protos.program.arguments import Commands
 
 EXIT_OK = 0
 

@@ -5,15 +5,15 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING
 
-from controlplane.cli.text_table import columns
-from protos.model.explanation import AlternativeKind, Correlation
+from plr.controlplane.cli.text_table import columns
+from plr.protos.model.explanation import AlternativeKind, Correlation
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
-    from protos.base.histogram import Histogram
-    from protos.model.explanation import Alternative, Explanation, JointExplanation, MappingChange, PairExplanation
-    from protos.model.mapping import Assignment
+    from plr.protos.base.histogram import Histogram
+    from plr.protos.model.explanation import Alternative, Explanation, JointExplanation, MappingChange, PairExplanation
+    from plr.protos.model.mapping import Assignment
 
 LEAST_SHOWN = 1e-9
 """Smallest probability worth showing: with less it would take years to see one miss."""

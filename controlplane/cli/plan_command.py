@@ -10,21 +10,21 @@ from dataclasses import asdict, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from controlplane.planning import plan_text
-from controlplane.planning.plot import PlotError, draw
-from controlplane.planning.prospects import least_set
-from controlplane.planning.traces import TraceError, read_trace
-from controlplane.planning.workload import DEFAULT, Compute, Workload
-from protos.base.printable import escaped
-from protos.program import extras
-from protos.program.arguments import whole
+from plr.controlplane.planning import plan_text
+from plr.controlplane.planning.plot import PlotError, draw
+from plr.controlplane.planning.prospects import least_set
+from plr.controlplane.planning.traces import TraceError, read_trace
+from plr.controlplane.planning.workload import DEFAULT, Compute, Workload
+from plr.protos.base.printable import escaped
+from plr.protos.program import extras
+from plr.protos.program.arguments import whole
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
-    from controlplane.planning.prospects import Source
-    from controlplane.planning.traces import RecordedPaths
-    from protos.program.arguments import Commands
+    from plr.controlplane.planning.prospects import Source
+    from plr.controlplane.planning.traces import RecordedPaths
+    from plr.protos.program.arguments import Commands
 
 EXIT_MET = 0
 EXIT_NOT_MET = 1
@@ -128,7 +128,7 @@ def _plan(arguments: argparse.Namespace) -> int:
         sys.stderr.write(f"plr plan: {lacking}\n")
         return EXIT_USAGE
     # This imports numpy, which an operator who only queries does not need.
-    from controlplane.planning.recorded import RecordingError
+    from plr.controlplane.planning.recorded import RecordingError
 
     try:
         source, deadline_s = _recorded(arguments) if arguments.recorded is not None else _replayed(arguments)
@@ -156,7 +156,7 @@ def _plan(arguments: argparse.Namespace) -> int:
 
 
 def _recorded(arguments: argparse.Namespace) -> tuple[Source, float]:
-    from controlplane.planning.recorded import RecordedService, read_recording
+    from plr.controlplane.planning.recorded import RecordedService, read_recording
 
     if _given(arguments):
         raise _UsageError("sizes, rate and computing times go with --traces: what was recorded is as it was")
@@ -166,7 +166,7 @@ def _recorded(arguments: argparse.Namespace) -> tuple[Source, float]:
 
 
 def _replayed(arguments: argparse.Namespace) -> tuple[Source, float]:
-    from controlplane.planning.replay import ReplayedTraces
+    from plr.controlplane.planning.replay import ReplayedTraces
 
     if arguments.deadline_ms is None:
         raise _UsageError("--traces needs --deadline-ms")

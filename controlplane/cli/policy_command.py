@@ -6,16 +6,16 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from controlplane.config.controlplane import load_config
-from controlplane.core.policy.explain import explain
-from protos.base.errors import ConfigError
-from protos.model.names import node_name, service_name
-from protos.program.arguments import checked
+from plr.controlplane.config.controlplane import load_config
+from plr.controlplane.core.policy.explain import explain
+from plr.protos.base.errors import ConfigError
+from plr.protos.model.names import node_name, service_name
+from plr.protos.program.arguments import checked
 
 if TYPE_CHECKING:
     import argparse
 
-    from protos.program.arguments import Commands
+    from plr.protos.program.arguments import Commands
 
 EXIT_ALLOWED = 0
 EXIT_DENIED = 1

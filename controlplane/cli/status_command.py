@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING
 
 import grpc
 
-from controlplane.cli import event_text, status_table
-from controlplane.cli.admin_client import EXIT_FAILED, AskError, add_options, ask
-from protos.base.errors import DecodeError
-from protos.convert import (
+from plr.controlplane.cli import event_text, status_table
+from plr.controlplane.cli.admin_client import EXIT_FAILED, AskError, add_options, ask
+from plr.protos.base.errors import DecodeError
+from plr.protos.convert import (
     departed_from_proto,
     events_from_proto,
     log_state_from_proto,
@@ -21,20 +21,20 @@ from protos.convert import (
     status_from_proto,
     status_query_to_proto,
 )
-from protos.convert.fields import MAX_SIDECARS
-from protos.model.names import node_name
-from protos.model.status import StatusQuery
-from protos.plr.v1 import admin_pb2
-from protos.program.arguments import checked
+from plr.protos.convert.fields import MAX_SIDECARS
+from plr.protos.model.names import node_name
+from plr.protos.model.status import StatusQuery
+from plr.protos.plr.v1 import admin_pb2
+from plr.protos.program.arguments import checked
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
 
-    from protos.model.fleet_events import DepartedSidecar
-    from protos.model.ids import NodeName
-    from protos.model.status import SidecarStatus
-    from protos.plr.v1 import admin_pb2_grpc
-    from protos.program.arguments import Commands
+    from plr.protos.model.fleet_events import DepartedSidecar
+    from plr.protos.model.ids import NodeName
+    from plr.protos.model.status import SidecarStatus
+    from plr.protos.plr.v1 import admin_pb2_grpc
+    from plr.protos.program.arguments import Commands
 
 EXIT_OK = 0
 

@@ -6,17 +6,17 @@ import difflib
 import math
 from typing import TYPE_CHECKING
 
-from controlplane.cli.text_table import columns, listed, shortened
-from protos.model.ids import Role
-from protos.model.members import NO_REVOCATIONS, RevocationSet
-from protos.model.status import SyncState
+from plr.controlplane.cli.text_table import columns, listed, shortened
+from plr.protos.model.ids import Role
+from plr.protos.model.members import NO_REVOCATIONS, RevocationSet
+from plr.protos.model.status import SyncState
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 
-    from protos.model.mapping import ServiceMapping
-    from protos.model.report import PathReport
-    from protos.model.status import ResourceStatus, SidecarStatus
+    from plr.protos.model.mapping import ServiceMapping
+    from plr.protos.model.report import PathReport
+    from plr.protos.model.status import ResourceStatus, SidecarStatus
 
 MAX_LINES = 256
 """Most lines on one sidecar: its claims of what it offers, lacks or reaches must not hide the others."""

@@ -6,14 +6,14 @@ from typing import TYPE_CHECKING, Annotated, Literal, Self
 
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, model_validator
 
-from controlplane.config.pattern_fields import InterfacePatterns, NodePatterns, one_or_list
-from controlplane.config.policy import PolicyConfig
-from controlplane.core.control.events import Settings
-from controlplane.core.policy.path_rules import MAX_PATH_RULES, PathRule
-from controlplane.core.problem.problem import Objective
-from protos.base.errors import ConfigError
-from protos.base.host_port import is_loopback
-from protos.program.config_fields import (
+from plr.controlplane.config.pattern_fields import InterfacePatterns, NodePatterns, one_or_list
+from plr.controlplane.config.policy import PolicyConfig
+from plr.controlplane.core.control.events import Settings
+from plr.controlplane.core.policy.path_rules import MAX_PATH_RULES, PathRule
+from plr.controlplane.core.problem.problem import Objective
+from plr.protos.base.errors import ConfigError
+from plr.protos.base.host_port import is_loopback
+from plr.protos.program.config_fields import (
     AbsolutePath,
     ListenAddress,
     RemoteAddress,
@@ -21,7 +21,7 @@ from protos.program.config_fields import (
     check_security,
     refuse_duplicates,
 )
-from protos.program.config_file import parse_yaml, read_text, validate
+from plr.protos.program.config_file import parse_yaml, read_text, validate
 
 if TYPE_CHECKING:
     from pathlib import Path

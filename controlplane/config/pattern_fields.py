@@ -6,9 +6,9 @@ from typing import Annotated
 
 from pydantic import AfterValidator, BeforeValidator, Field
 
-from controlplane.core.policy.patterns import MAX_PATTERN_CHARACTERS, NameKind, can_match
-from controlplane.core.policy.policy import MAX_PATTERNS
-from protos.program.config_fields import refuse_duplicates
+from plr.controlplane.core.policy.patterns import MAX_PATTERN_CHARACTERS, NameKind, can_match
+from plr.controlplane.core.policy.policy import MAX_PATTERNS
+from plr.protos.program.config_fields import refuse_duplicates
 
 _EXAMPLES = {
     NameKind.NODE: "a name of letters, digits, '_', '.' and '-', or a pattern such as arm-*",

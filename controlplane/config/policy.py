@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from controlplane.config.pattern_fields import NodePatterns, ServicePatterns
-from controlplane.core.policy.policy import MAX_RULES, CallRule, OfferRule, Policy
+from plr.controlplane.config.pattern_fields import NodePatterns, ServicePatterns
+from plr.controlplane.core.policy.policy import MAX_RULES, CallRule, OfferRule, Policy
 
 
 class CallRuleConfig(BaseModel):

@@ -10,16 +10,16 @@ import asyncio
 import logging
 from typing import TYPE_CHECKING
 
-from controlplane.config.controlplane import load_config
-from protos.base.errors import ConfigError
+from plr.controlplane.config.controlplane import load_config
+from plr.protos.base.errors import ConfigError
 
 if TYPE_CHECKING:
     from collections.abc import Callable
     from pathlib import Path
 
-    from controlplane.config.controlplane import ControlPlaneConfig
-    from controlplane.core.policy.policy import Policy
-    from controlplane.observe.metrics import Metrics
+    from plr.controlplane.config.controlplane import ControlPlaneConfig
+    from plr.controlplane.core.policy.policy import Policy
+    from plr.controlplane.observe.metrics import Metrics
 
 log = logging.getLogger(__name__)
 

@@ -6,10 +6,10 @@ import json
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Any, TypeVar
 
-from protos.base.errors import DecodeError
-from protos.model.fleet_events import EventKind, FleetEvent, Why
-from protos.model.ids import Role
-from protos.model.names import clean_text, node_name
+from plr.protos.base.errors import DecodeError
+from plr.protos.model.fleet_events import EventKind, FleetEvent, Why
+from plr.protos.model.ids import Role
+from plr.protos.model.names import clean_text, node_name
 
 if TYPE_CHECKING:
     import enum

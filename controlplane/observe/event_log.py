@@ -21,20 +21,20 @@ from bisect import bisect_left
 from collections import deque
 from typing import IO, TYPE_CHECKING
 
-from controlplane.core.explain.event_memory import EventMemory
-from controlplane.observe.event_lines import decode, encode
-from protos.base.errors import DecodeError
-from protos.model.fleet_events import EventKind, EventLogState, FleetEvent
-from protos.model.names import clean_text
-from protos.program import own_folder
-from protos.program.own_folder import OwnFolder
+from plr.controlplane.core.explain.event_memory import EventMemory
+from plr.controlplane.observe.event_lines import decode, encode
+from plr.protos.base.errors import DecodeError
+from plr.protos.model.fleet_events import EventKind, EventLogState, FleetEvent
+from plr.protos.model.names import clean_text
+from plr.protos.program import own_folder
+from plr.protos.program.own_folder import OwnFolder
 
 if TYPE_CHECKING:
     from collections.abc import Callable
     from pathlib import Path
 
-    from protos.model.fleet_events import EventQuery, Why
-    from protos.model.ids import NodeName, Role
+    from plr.protos.model.fleet_events import EventQuery, Why
+    from plr.protos.model.ids import NodeName, Role
 
 log = logging.getLogger(__name__)
 

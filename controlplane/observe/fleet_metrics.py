@@ -19,16 +19,16 @@ from typing import TYPE_CHECKING, cast
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, InfoMetricFamily
 from prometheus_client.samples import Sample
 
-from protos.model.ids import Role
+from plr.protos.model.ids import Role
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
 
     from prometheus_client import Metric
 
-    from controlplane.core.explain.fleet_view import MemberView, MissView, ServedView
-    from protos.model.fleet_events import DepartedSidecar
-    from protos.model.ids import NodeName
+    from plr.controlplane.core.explain.fleet_view import MemberView, MissView, ServedView
+    from plr.protos.model.fleet_events import DepartedSidecar
+    from plr.protos.model.ids import NodeName
 
 MAX_SERIES = 100_000
 """Most series of all members."""

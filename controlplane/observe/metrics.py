@@ -14,25 +14,25 @@ from typing import TYPE_CHECKING
 import prometheus_client
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily
 
-from controlplane.observe.fleet_metrics import FleetCollector
-from controlplane.serve import handshakes, stream_limits, tls_gate
-from protos.model.fleet_events import EventLogState
-from protos.model.ids import Role
-from protos.model.status import SyncState
-from protos.model.stream import ResourceKind
-from protos.program.metrics_server import MetricsServer
-from protos.trust import identity
-from protos.trust.revocation_views import revocation_gauges
+from plr.controlplane.observe.fleet_metrics import FleetCollector
+from plr.controlplane.serve import handshakes, stream_limits, tls_gate
+from plr.protos.model.fleet_events import EventLogState
+from plr.protos.model.ids import Role
+from plr.protos.model.status import SyncState
+from plr.protos.model.stream import ResourceKind
+from plr.protos.program.metrics_server import MetricsServer
+from plr.protos.trust import identity
+from plr.protos.trust.revocation_views import revocation_gauges
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping, Sequence
 
     from prometheus_client import Metric
 
-    from controlplane.core.control.control import ControlCore
-    from controlplane.observe.fleet_metrics import Fleet
-    from controlplane.serve.stun_server import StunServer
-    from protos.trust.identity import Identity, RevocationList
+    from plr.controlplane.core.control.control import ControlCore
+    from plr.controlplane.observe.fleet_metrics import Fleet
+    from plr.controlplane.serve.stun_server import StunServer
+    from plr.protos.trust.identity import Identity, RevocationList
 
 SOLVE_BUCKETS_S = (0.001, 0.003, 0.01, 0.03, 0.1, 0.3, 1.0, 3.0, 10.0)
 """Buckets of the solving time: one robot takes milliseconds, a hundred a quarter of a second, a thousand seconds."""

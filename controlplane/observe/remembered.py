@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from controlplane.core.explain.departed import Departure
-from protos.model.fleet_events import EventKind, FleetEvent, Why
+from plr.controlplane.core.explain.departed import Departure
+from plr.protos.model.fleet_events import EventKind, FleetEvent, Why
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from protos.model.ids import NodeName
+    from plr.protos.model.ids import NodeName
 
 
 def departures(

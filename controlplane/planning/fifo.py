@@ -18,7 +18,7 @@ _BYTES_PER_KBIT = 125.0
 
 
 class Direction(Protocol):
-    """One direction of a path during one step: `controlplane.planning.traces.Direction`, or a link of the lab."""
+    """One direction of a path during one step: `plr.controlplane.planning.traces.Direction`, or a link of the lab."""
 
     @property
     def rate_kbps(self) -> float | None:

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from controlplane.cli.text_table import columns
-from controlplane.planning.prospects import least_set, paths_needed
-from protos.base.printable import escaped
+from plr.controlplane.cli.text_table import columns
+from plr.controlplane.planning.prospects import least_set, paths_needed
+from plr.protos.base.printable import escaped
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
-    from controlplane.planning.prospects import Prospect, Source
+    from plr.controlplane.planning.prospects import Prospect, Source
 
 HEADER = ("INTERFACES", "SERVERS", "PRODUCT", "JOINT", "JOINT/PRODUCT", "BEST SET")
 

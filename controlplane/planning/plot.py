@@ -6,13 +6,13 @@ import html
 import io
 from typing import TYPE_CHECKING
 
-from controlplane.planning import plan_text
+from plr.controlplane.planning import plan_text
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
     from pathlib import Path
 
-    from controlplane.planning.prospects import Prospect, Source
+    from plr.controlplane.planning.prospects import Prospect, Source
 
 SPAN = 8.0
 """Ratio of the axis limits to the given deadline: deadlines from 1/SPAN of it to SPAN times it are drawn."""

@@ -9,16 +9,16 @@ from typing import TYPE_CHECKING
 import numpy as np
 from google.protobuf import json_format
 
-from controlplane.core.estimate.distribution import Distribution
-from controlplane.core.estimate.posterior import IGNORANCE
-from controlplane.core.problem.objectives import joint_miss, objective_costs
-from controlplane.core.problem.problem import Block, BlockKey, Objective
-from controlplane.planning.prospects import Prospect
-from protos.base.errors import DecodeError
-from protos.convert import explanation_from_proto
-from protos.model.explanation import SAMPLE
-from protos.plr.v1 import admin_pb2
-from protos.program.regular_file import read_regular
+from plr.controlplane.core.estimate.distribution import Distribution
+from plr.controlplane.core.estimate.posterior import IGNORANCE
+from plr.controlplane.core.problem.objectives import joint_miss, objective_costs
+from plr.controlplane.core.problem.problem import Block, BlockKey, Objective
+from plr.controlplane.planning.prospects import Prospect
+from plr.protos.base.errors import DecodeError
+from plr.protos.convert import explanation_from_proto
+from plr.protos.model.explanation import SAMPLE
+from plr.protos.plr.v1 import admin_pb2
+from plr.protos.program.regular_file import read_regular
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterator, Mapping, Sequence
@@ -26,11 +26,11 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from controlplane.core.problem.problem import Choice
-    from controlplane.core.problem.problem import Path as PathIndex
-    from protos.base.histogram import Histogram
-    from protos.model.explanation import Explanation, PairExplanation
-    from protos.model.mapping import Assignment
+    from plr.controlplane.core.problem.problem import Choice
+    from plr.controlplane.core.problem.problem import Path as PathIndex
+    from plr.protos.base.histogram import Histogram
+    from plr.protos.model.explanation import Explanation, PairExplanation
+    from plr.protos.model.mapping import Assignment
 
 MAX_CHOICES = 20_000
 """Most sets examined; if there are more, only the servers with the least epsilon of each interface are used."""

@@ -10,18 +10,18 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from controlplane.core.estimate.posterior import IGNORANCE
-from controlplane.planning.fifo import FifoPath
-from controlplane.planning.prospects import Prospect
-from controlplane.planning.traces import PATHS
+from plr.controlplane.core.estimate.posterior import IGNORANCE
+from plr.controlplane.planning.fifo import FifoPath
+from plr.controlplane.planning.prospects import Prospect
+from plr.controlplane.planning.traces import PATHS
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from numpy.typing import NDArray
 
-    from controlplane.planning.traces import RecordedPaths
-    from controlplane.planning.workload import Workload
+    from plr.controlplane.planning.traces import RecordedPaths
+    from plr.controlplane.planning.workload import Workload
 
     Latencies = NDArray[np.float64]
 

@@ -18,7 +18,7 @@ from dataclasses import dataclass
 from itertools import pairwise
 from typing import TYPE_CHECKING
 
-from protos.program.regular_file import read_regular
+from plr.protos.program.regular_file import read_regular
 
 if TYPE_CHECKING:
     from pathlib import Path

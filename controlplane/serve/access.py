@@ -7,13 +7,13 @@ from typing import TYPE_CHECKING, Any
 
 import grpc
 
-from protos.program.certificate_term import with_remedy
-from protos.trust.identity import WRONG_ROLE, IdentityRole
+from plr.protos.program.certificate_term import with_remedy
+from plr.protos.trust.identity import WRONG_ROLE, IdentityRole
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Awaitable, Callable
 
-    from controlplane.serve.tls_gate import Caller
+    from plr.controlplane.serve.tls_gate import Caller
 
     _Handler = grpc.RpcMethodHandler[Any, Any]
 

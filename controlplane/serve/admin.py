@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING, Any, NoReturn
 
 import grpc
 
-from controlplane.core.explain.explanation import UnknownNameError
-from protos.base.errors import DecodeError
-from protos.convert import (
+from plr.controlplane.core.explain.explanation import UnknownNameError
+from plr.protos.base.errors import DecodeError
+from plr.protos.convert import (
     departed_to_proto,
     event_query_from_proto,
     event_to_proto,
@@ -23,13 +23,13 @@ from protos.convert import (
     status_query_from_proto,
     status_to_proto,
 )
-from protos.model.status import StatusQuery
-from protos.plr.v1 import admin_pb2
+from plr.protos.model.status import StatusQuery
+from plr.protos.plr.v1 import admin_pb2
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
 
-    from controlplane.loop import ControlLoop
+    from plr.controlplane.loop import ControlLoop
 
 SERVICE_NAME = admin_pb2.DESCRIPTOR.services_by_name["Admin"].full_name
 

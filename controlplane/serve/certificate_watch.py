@@ -7,21 +7,21 @@ import logging
 import ssl
 from typing import TYPE_CHECKING, NoReturn
 
-from protos.base.errors import ConfigError
-from protos.convert.fields import MAX_CRL_BYTES
-from protos.program.tls_files import POLL_INTERVAL_S, TlsFiles, TlsWatch, load_tls_files
-from protos.trust.identity import IdentityRole
-from protos.trust.revocation_views import revocation_set
+from plr.protos.base.errors import ConfigError
+from plr.protos.convert.fields import MAX_CRL_BYTES
+from plr.protos.program.tls_files import POLL_INTERVAL_S, TlsFiles, TlsWatch, load_tls_files
+from plr.protos.trust.identity import IdentityRole
+from plr.protos.trust.revocation_views import revocation_set
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
     from pathlib import Path
 
-    from controlplane.loop import ControlLoop
-    from controlplane.observe.metrics import Metrics
-    from controlplane.serve.tls_gate import TlsGate
-    from protos.model.ids import NodeName
-    from protos.trust.clock_floor import ClockFloor
+    from plr.controlplane.loop import ControlLoop
+    from plr.controlplane.observe.metrics import Metrics
+    from plr.controlplane.serve.tls_gate import TlsGate
+    from plr.protos.model.ids import NodeName
+    from plr.protos.trust.clock_floor import ClockFloor
 
 log = logging.getLogger(__name__)
 

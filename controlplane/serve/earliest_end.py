@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
-    from protos.model.ids import NodeName
+    from plr.protos.model.ids import NodeName
 
 
 class EarliestEnd:

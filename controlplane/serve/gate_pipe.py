@@ -112,5 +112,5 @@ class PipeEnd(asyncio.Protocol):
             return
         other.close()
         if other.lost:
-            # Break the cycle: the collector skips long-lived objects (`protos.program.interpreter`).
+            # Break the cycle: the collector skips long-lived objects (`plr.protos.program.interpreter`).
             self._other = other._other = None

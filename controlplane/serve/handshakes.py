@@ -6,10 +6,10 @@ import os
 import ssl
 from typing import TYPE_CHECKING
 
-from protos.trust.identity import UNTRUSTED
+from plr.protos.trust.identity import UNTRUSTED
 
 if TYPE_CHECKING:
-    from protos.program.tls_files import TlsFiles
+    from plr.protos.program.tls_files import TlsFiles
 
 NO_CERTIFICATE = "no_certificate"
 OLD_TLS = "old_tls"

@@ -8,14 +8,14 @@ from __future__ import annotations
 import asyncio
 from typing import TYPE_CHECKING
 
-from protos.model.mapping import MappingSet
-from protos.model.members import PeerSet
-from protos.model.peer_changes import put_together
-from protos.model.stream import Welcome
+from plr.protos.model.mapping import MappingSet
+from plr.protos.model.members import PeerSet
+from plr.protos.model.peer_changes import put_together
+from plr.protos.model.stream import Welcome
 
 if TYPE_CHECKING:
-    from controlplane.core.publish.messages import CloseReason
-    from protos.model.stream import ControlMessage
+    from plr.controlplane.core.publish.messages import CloseReason
+    from plr.protos.model.stream import ControlMessage
 
 _ORDER = (Welcome, PeerSet, MappingSet)
 """Order of writing: a mapping follows the peers that it names."""

@@ -16,27 +16,27 @@ import grpc
 from grpc_health.v1 import health, health_pb2, health_pb2_grpc
 from grpc_reflection.v1alpha import reflection
 
-from controlplane.core.registry.registry import MAX_SIDECARS
-from controlplane.loop import ControlLoop
-from controlplane.observe.event_log import EventLog
-from controlplane.observe.metrics import Metrics
-from controlplane.serve import admin, service
-from controlplane.serve.access import AccessGuard
-from controlplane.serve.certificate_watch import CertificateKeeper
-from controlplane.serve.stream_limits import MAX_MESSAGE_BYTES, MAX_STREAMS_PER_CONNECTION
-from controlplane.serve.stun_server import start_stun_server
-from controlplane.serve.tls_gate import TlsGate
-from protos.base.host_port import split_host_port
-from protos.model.fleet_events import EventKind
-from protos.program.version_option import describe
-from protos.trust.clock_floor import ClockFloor
+from plr.controlplane.core.registry.registry import MAX_SIDECARS
+from plr.controlplane.loop import ControlLoop
+from plr.controlplane.observe.event_log import EventLog
+from plr.controlplane.observe.metrics import Metrics
+from plr.controlplane.serve import admin, service
+from plr.controlplane.serve.access import AccessGuard
+from plr.controlplane.serve.certificate_watch import CertificateKeeper
+from plr.controlplane.serve.stream_limits import MAX_MESSAGE_BYTES, MAX_STREAMS_PER_CONNECTION
+from plr.controlplane.serve.stun_server import start_stun_server
+from plr.controlplane.serve.tls_gate import TlsGate
+from plr.protos.base.host_port import split_host_port
+from plr.protos.model.fleet_events import EventKind
+from plr.protos.program.version_option import describe
+from plr.protos.trust.clock_floor import ClockFloor
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from controlplane.config.controlplane import ControlPlaneConfig
-    from controlplane.config.policy_reload import PolicyReload
-    from protos.program.tls_files import TlsFiles
+    from plr.controlplane.config.controlplane import ControlPlaneConfig
+    from plr.controlplane.config.policy_reload import PolicyReload
+    from plr.protos.program.tls_files import TlsFiles
 
 log = logging.getLogger(__name__)
 

@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING, NoReturn
 
 import grpc
 
-from controlplane.core.publish.messages import CloseReason
-from controlplane.core.registry.registry import Refusal
-from controlplane.serve.stream_encoder import StreamEncoder
-from controlplane.serve.stream_limits import (
+from plr.controlplane.core.publish.messages import CloseReason
+from plr.controlplane.core.registry.registry import Refusal
+from plr.controlplane.serve.stream_encoder import StreamEncoder
+from plr.controlplane.serve.stream_limits import (
     MAX_FIRST_BYTES,
     MAX_STREAMS_PER_NAME,
     TOO_FAST,
@@ -19,27 +19,27 @@ from controlplane.serve.stream_limits import (
     StreamCount,
     StreamRate,
 )
-from protos.base.errors import DecodeError, UnknownKindError
-from protos.convert import (
+from plr.protos.base.errors import DecodeError, UnknownKindError
+from plr.protos.convert import (
     parse_in_parts,
     parse_sidecar_message,
     read_sidecar_message,
     sidecar_message_from_proto,
 )
-from protos.convert.reports import report_entries
-from protos.model.members import Registration
-from protos.model.protocol_versions import Spoken, refusal
-from protos.model.report import Report
-from protos.model.stream import Heartbeat
-from protos.plr.v1 import control_pb2
+from plr.protos.convert.reports import report_entries
+from plr.protos.model.members import Registration
+from plr.protos.model.protocol_versions import Spoken, refusal
+from plr.protos.model.report import Report
+from plr.protos.model.stream import Heartbeat
+from plr.protos.plr.v1 import control_pb2
 
 if TYPE_CHECKING:
-    from controlplane.core.registry.registry import StreamId
-    from controlplane.loop import ControlLoop
-    from controlplane.serve.mailbox import Mailbox
-    from controlplane.serve.tls_gate import Caller, TlsGate
-    from protos.model.ids import NodeName
-    from protos.model.stream import SidecarMessage
+    from plr.controlplane.core.registry.registry import StreamId
+    from plr.controlplane.loop import ControlLoop
+    from plr.controlplane.serve.mailbox import Mailbox
+    from plr.controlplane.serve.tls_gate import Caller, TlsGate
+    from plr.protos.model.ids import NodeName
+    from plr.protos.model.stream import SidecarMessage
 
     Context = grpc.aio.ServicerContext[bytes, bytes]
 

@@ -8,17 +8,17 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from controlplane.core.publish.told_peers import ToldPeers
-from protos.convert.control import control_message_to_proto, peer_set_header_to_proto
-from protos.convert.types import peer_to_proto
-from protos.model.members import TOKEN_BYTES, PeerSet
-from protos.plr.v1 import control_pb2, types_pb2
+from plr.controlplane.core.publish.told_peers import ToldPeers
+from plr.protos.convert.control import control_message_to_proto, peer_set_header_to_proto
+from plr.protos.convert.types import peer_to_proto
+from plr.protos.model.members import TOKEN_BYTES, PeerSet
+from plr.protos.plr.v1 import control_pb2, types_pb2
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from protos.model.members import Peer
-    from protos.model.stream import ControlMessage
+    from plr.protos.model.members import Peer
+    from plr.protos.model.stream import ControlMessage
 
 PART_BYTES = 256 << 10
 """Bytes of a set's peers in one message: some 350 peers, a few milliseconds of the loop, far below gRPC's 4 MiB."""

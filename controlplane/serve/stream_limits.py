@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 
-from protos.base.token_bucket import TokenBucket
+from plr.protos.base.token_bucket import TokenBucket
 
 TOO_MANY_STREAMS = "too_many_streams"
 TOO_FAST = "too_fast"

@@ -24,13 +24,13 @@ from collections import Counter
 from ipaddress import IPv6Address
 from typing import TYPE_CHECKING, Any
 
-from controlplane.core.stun.responder import StunOutcome, StunResponder
-from protos.stun.codec import MAX_MESSAGE_BYTES
+from plr.controlplane.core.stun.responder import StunOutcome, StunResponder
+from plr.protos.stun.codec import MAX_MESSAGE_BYTES
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from protos.model.ids import Address
+    from plr.protos.model.ids import Address
 
 log = logging.getLogger(__name__)
 

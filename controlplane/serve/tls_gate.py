@@ -25,21 +25,21 @@ from dataclasses import dataclass, field
 from functools import partial
 from typing import TYPE_CHECKING
 
-from controlplane.core.overload.admission import Admission
-from controlplane.serve.earliest_end import EarliestEnd
-from controlplane.serve.gate_pipe import PipeEnd
-from controlplane.serve.half_open import HalfOpen
-from controlplane.serve.handshakes import server_context, why_failed
-from protos.base.token_bucket import TokenBucket
-from protos.trust.identity import CertificateError, IdentityRole
+from plr.controlplane.core.overload.admission import Admission
+from plr.controlplane.serve.earliest_end import EarliestEnd
+from plr.controlplane.serve.gate_pipe import PipeEnd
+from plr.controlplane.serve.half_open import HalfOpen
+from plr.controlplane.serve.handshakes import server_context, why_failed
+from plr.protos.base.token_bucket import TokenBucket
+from plr.protos.trust.identity import CertificateError, IdentityRole
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
-    from protos.model.ids import NodeName
-    from protos.program.tls_files import TlsFiles
-    from protos.trust.clock_floor import ClockFloor
-    from protos.trust.identity import Identity, Trust
+    from plr.protos.model.ids import NodeName
+    from plr.protos.program.tls_files import TlsFiles
+    from plr.protos.trust.clock_floor import ClockFloor
+    from plr.protos.trust.identity import Identity, Trust
 
 log = logging.getLogger(__name__)
 

@@ -12,16 +12,16 @@ import time
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
-from controlplane.core.problem.plan import choice_of, relative_gap
-from controlplane.core.solve.decomposition import Decomposition, Relaxed
-from controlplane.core.solve.limits import Limits
-from controlplane.solver.cp_sat import RESOLUTION, Column, pick_columns
+from plr.controlplane.core.problem.plan import choice_of, relative_gap
+from plr.controlplane.core.solve.decomposition import Decomposition, Relaxed
+from plr.controlplane.core.solve.limits import Limits
+from plr.controlplane.solver.cp_sat import RESOLUTION, Column, pick_columns
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from controlplane.core.problem.plan import Plan
-    from controlplane.core.problem.problem import Block, BlockKey, Choice, FleetKey, Problem
+    from plr.controlplane.core.problem.plan import Plan
+    from plr.controlplane.core.problem.problem import Block, BlockKey, Choice, FleetKey, Problem
 
 log = logging.getLogger(__name__)
 

@@ -12,16 +12,16 @@ from collections import Counter
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
-from controlplane.core.problem.plan import Plan, make_plan
-from controlplane.core.problem.problem import FleetKey, reachable
-from controlplane.core.solve.decomposition import Decomposition
-from controlplane.core.solve.limits import Limits, independent_groups
-from controlplane.solver.group import SMALL_BLOCKS, solve_group
+from plr.controlplane.core.problem.plan import Plan, make_plan
+from plr.controlplane.core.problem.problem import FleetKey, reachable
+from plr.controlplane.core.solve.decomposition import Decomposition
+from plr.controlplane.core.solve.limits import Limits, independent_groups
+from plr.controlplane.solver.group import SMALL_BLOCKS, solve_group
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
 
-    from controlplane.core.problem.problem import Block, BlockKey, Problem
+    from plr.controlplane.core.problem.problem import Block, BlockKey, Problem
 
 CHANGED_SHARE = 0.02
 """Beyond this share of changed blocks all are solved: that costs little more, and can move others out of the way."""

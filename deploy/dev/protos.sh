@@ -9,7 +9,7 @@ cd "$(dirname "$0")/../.."
 generate() {
   # protoc finds the plug-ins for typed stubs on the PATH.
   PATH=$PWD/.venv/bin:$PATH .venv/bin/python -m grpc_tools.protoc -I. \
-    --python_out="$1" --mypy_out="quiet:$1" --grpc_python_out="$1" --mypy_grpc_out="quiet:$1" protos/plr/v1/*.proto
+    --python_out="$1" --mypy_out="quiet:$1" --grpc_python_out="$1" --mypy_grpc_out="quiet:$1" plr/protos/plr/v1/*.proto
 }
 
 case ${1:-} in
@@ -22,7 +22,7 @@ case ${1:-} in
     generate "$fresh"
     # Both directions: a stub left over from a .proto that is gone is drift as well.
     if ! diff -ru --exclude='*.proto' --exclude='__init__.py' --exclude='__pycache__' --exclude='py.typed' \
-      "$fresh/protos/plr/v1" protos/plr/v1; then
+      "$fresh/plr/protos/plr/v1" protos/plr/v1; then
       echo "protos: the stubs do not match the .proto files; run: make protos" >&2
       exit 1
     fi

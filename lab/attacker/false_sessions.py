@@ -9,29 +9,29 @@ from typing import TYPE_CHECKING
 
 from cryptography.hazmat.primitives.asymmetric.x25519 import X25519PrivateKey, X25519PublicKey
 
-from protos.model.ids import InterfaceId, Role
-from protos.trust.credential import decode_credential, session_number
-from protos.trust.pair_token import pair_token
-from sidecar.core.crypto.aead import TAG_BYTES
-from sidecar.core.crypto.key_schedule import pair_keys
-from sidecar.core.crypto.session import public_key
-from sidecar.core.path.key_exchange import DEFAULT_LIMITS
-from sidecar.core.path.keys import make_path_keys
-from sidecar.core.wire import frame
-from sidecar.core.wire.frame import HEADER_BYTES, NONCE_OFFSET, Header
-from sidecar.core.wire.introduction import encode_introduction
+from plr.protos.model.ids import InterfaceId, Role
+from plr.protos.trust.credential import decode_credential, session_number
+from plr.protos.trust.pair_token import pair_token
+from plr.sidecar.core.crypto.aead import TAG_BYTES
+from plr.sidecar.core.crypto.key_schedule import pair_keys
+from plr.sidecar.core.crypto.session import public_key
+from plr.sidecar.core.path.key_exchange import DEFAULT_LIMITS
+from plr.sidecar.core.path.keys import make_path_keys
+from plr.sidecar.core.wire import frame
+from plr.sidecar.core.wire.frame import HEADER_BYTES, NONCE_OFFSET, Header
+from plr.sidecar.core.wire.introduction import encode_introduction
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
     from cryptography.hazmat.primitives.asymmetric import ec
 
-    from protos.trust.credential import SessionCredential
-    from sidecar.core.crypto.key_schedule import PairKeys
-    from sidecar.core.link.sender import LinkIdentity
-    from sidecar.core.path.keys import SealingKeys
-    from sidecar.core.path.path import Path
-    from sidecar.core.seam.links import LinkPeer
+    from plr.protos.trust.credential import SessionCredential
+    from plr.sidecar.core.crypto.key_schedule import PairKeys
+    from plr.sidecar.core.link.sender import LinkIdentity
+    from plr.sidecar.core.path.keys import SealingKeys
+    from plr.sidecar.core.path.path import Path
+    from plr.sidecar.core.seam.links import LinkPeer
 
 PHANTOMS = range(200, 231)
 """Numbers of interfaces that no host here has; with the member's own, as many as a peer may introduce."""

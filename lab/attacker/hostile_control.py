@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING
 
 from lab.attacker.hostile_link import ESCAPES
 from lab.attacker.orders import Stage
-from protos.base.histogram import MAX_COUNT, Histogram
-from protos.model.ids import InterfaceId, InterfaceName, NodeName, Role, ServiceName, Version
-from protos.model.members import (
+from plr.protos.base.histogram import MAX_COUNT, Histogram
+from plr.protos.model.ids import InterfaceId, InterfaceName, NodeName, Role, ServiceName, Version
+from plr.protos.model.members import (
     MAX_CANDIDATES_OF_INTERFACE,
     Candidate,
     CandidateKind,
@@ -23,14 +23,14 @@ from protos.model.members import (
     ServiceSet,
     ServiceUse,
 )
-from protos.model.report import LatencyReport, OutcomeReport, PathReport, Report
-from protos.model.stream import Heartbeat, Nack, ResourceKind
-from protos.trust.candidate_signature import sign_candidates
-from sidecar.core.control.session import ControlSession, ControlState
+from plr.protos.model.report import LatencyReport, OutcomeReport, PathReport, Report
+from plr.protos.model.stream import Heartbeat, Nack, ResourceKind
+from plr.protos.trust.candidate_signature import sign_candidates
+from plr.sidecar.core.control.session import ControlSession, ControlState
 
 if TYPE_CHECKING:
     from lab.attacker.hostile_means import Means
-    from protos.model.stream import SidecarMessage
+    from plr.protos.model.stream import SidecarMessage
 
 REPORTS_A_TURN = 10
 INTERFACES = 32

@@ -13,14 +13,14 @@ from typing import TYPE_CHECKING, Any
 from lab.attacker.false_sessions import FalseSessions
 from lab.attacker.orders import Stage
 from lab.attacker.spoofing import Spoofer
-from protos.model.ids import Role, ServiceName
-from sidecar.core.base.values import PathState, Priority, RejectReason, RequestId
-from sidecar.core.crypto.key_schedule import proof_of_offer
-from sidecar.core.crypto.session import public_key
-from sidecar.core.link.link import Link
-from sidecar.core.link.sender import Batch
-from sidecar.core.wire import frame
-from sidecar.core.wire.messages import (
+from plr.protos.model.ids import Role, ServiceName
+from plr.sidecar.core.base.values import PathState, Priority, RejectReason, RequestId
+from plr.sidecar.core.crypto.key_schedule import proof_of_offer
+from plr.sidecar.core.crypto.session import public_key
+from plr.sidecar.core.link.link import Link
+from plr.sidecar.core.link.sender import Batch
+from plr.sidecar.core.wire import frame
+from plr.sidecar.core.wire.messages import (
     CancelMessage,
     Message,
     RejectionMessage,
@@ -33,8 +33,8 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator
 
     from lab.attacker.hostile_means import Means
-    from sidecar.core.path.path import Path
-    from sidecar.core.seam.links import LinkPeer
+    from plr.sidecar.core.path.path import Path
+    from plr.sidecar.core.seam.links import LinkPeer
 
 SYMBOL = 1024
 ESCAPES = "\x1b[2J\x1b]0;owned\x07\r\n2026-01-01T00:00:00.000Z INFO runtime: all is well \u202e\x00\x9b31m"

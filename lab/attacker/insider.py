@@ -26,14 +26,14 @@ from lab.attacker.hostile_link import ESCAPES, LARGE_ANSWER, HostileLink
 from lab.attacker.hostile_means import Means
 from lab.attacker.orders import ORDERS, TALLY, Commander, Stage
 from lab.attacker.tally import Tally
-from protos.model.ids import ServiceName
-from protos.program.tls_files import load_tls_files
-from sidecar import __main__ as sidecar
-from sidecar import runtime
-from sidecar.core.base.values import RejectReason, RequestId
-from sidecar.core.engine.engine import Engine
-from sidecar.net import managed_interface
-from sidecar.net.dataplane import ThreadedDataPlane
+from plr.protos.model.ids import ServiceName
+from plr.protos.program.tls_files import load_tls_files
+from plr.sidecar import __main__ as sidecar
+from plr.sidecar import runtime
+from plr.sidecar.core.base.values import RejectReason, RequestId
+from plr.sidecar.core.engine.engine import Engine
+from plr.sidecar.net import managed_interface
+from plr.sidecar.net.dataplane import ThreadedDataPlane
 
 SERVICE = ("/echo", "plr_demo_interfaces/srv/DetectPeople")
 BAD_ANSWERS = 0.1

@@ -22,14 +22,14 @@ from lab.attacker.junk import mangled, noise
 from lab.attacker.orders import ORDERS, TALLY, Commander, Stage
 from lab.attacker.registration import registration
 from lab.attacker.tally import Tally
-from protos.model.ids import Role
-from protos.program.tls_files import load_tls_files
-from protos.stun.codec import MessageClass, StunMessage, encode
+from plr.protos.model.ids import Role
+from plr.protos.program.tls_files import load_tls_files
+from plr.protos.stun.codec import MessageClass, StunMessage, encode
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from protos.program.tls_files import TlsFiles
+    from plr.protos.program.tls_files import TlsFiles
 
 SILENT = 200
 """Silent connections held open at once; half as many more have begun a handshake."""

@@ -5,8 +5,8 @@ from __future__ import annotations
 import enum
 from typing import TYPE_CHECKING
 
-from sidecar.core.wire.frame import HEADER_BYTES, INTRODUCTION_FLAG, MAX_DATAGRAM_BYTES
-from sidecar.core.wire.introduction import HELLO_BYTES
+from plr.sidecar.core.wire.frame import HEADER_BYTES, INTRODUCTION_FLAG, MAX_DATAGRAM_BYTES
+from plr.sidecar.core.wire.introduction import HELLO_BYTES
 
 if TYPE_CHECKING:
     import random

@@ -6,10 +6,10 @@ import hashlib
 import time
 from typing import TYPE_CHECKING
 
-from protos.convert import sidecar_message_to_proto
-from protos.model.ids import PROTOCOL_VERSION, NodeName, Role, SessionId, Version
-from protos.model.members import Registration
-from protos.trust.credential import Aead, SessionCredential, session_number
+from plr.protos.convert import sidecar_message_to_proto
+from plr.protos.model.ids import PROTOCOL_VERSION, NodeName, Role, SessionId, Version
+from plr.protos.model.members import Registration
+from plr.protos.trust.credential import Aead, SessionCredential, session_number
 
 if TYPE_CHECKING:
     from cryptography.hazmat.primitives.asymmetric import ec

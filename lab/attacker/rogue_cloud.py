@@ -11,8 +11,8 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from sidecar import __main__ as sidecar
-from sidecar.core.engine.engine import Engine
+from plr.sidecar import __main__ as sidecar
+from plr.sidecar.core.engine.engine import Engine
 
 SHARE = ".share"
 GARBAGE_BYTES = 10

@@ -10,10 +10,10 @@ import dataclasses
 import sys
 from typing import Any
 
-from protos.model.ids import ServiceName
-from sidecar import __main__ as sidecar
-from sidecar.core.robot.dispatch import dispatcher
-from sidecar.core.wire.messages import RequestMessage
+from plr.protos.model.ids import ServiceName
+from plr.sidecar import __main__ as sidecar
+from plr.sidecar.core.robot.dispatch import dispatcher
+from plr.sidecar.core.wire.messages import RequestMessage
 
 WANTED = ServiceName("/echo")
 

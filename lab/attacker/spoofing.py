@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from lab.attacker.wire import ETHERNET_BYTES, Captured
 
 if TYPE_CHECKING:
-    from protos.model.ids import Address
+    from plr.protos.model.ids import Address
 
 THIRD_PARTYS_PORT = 4000
 

@@ -6,7 +6,7 @@ import json
 import threading
 from typing import TYPE_CHECKING
 
-from controlplane.ca.files import write_atomically
+from plr.controlplane.ca.files import write_atomically
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from types import TracebackType
 
     from lab import Host
-    from protos.model.ids import Address
+    from plr.protos.model.ids import Address
 
 ETHERNET_BYTES = 14
 _ETH_P_ALL = 3

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from protos.base.printable import escaped
+from plr.protos.base.printable import escaped
 
 
 class DecodeError(ValueError):

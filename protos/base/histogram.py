@@ -10,7 +10,7 @@ Layout 1::
 
 A value reported at the geometric middle of its bucket is off by less than 2 %. Histograms of the same layout merge by
 adding counts, which is exact and independent of the order. An earlier state of a histogram that only grew is subtracted
-just as exactly. Old samples fade in `controlplane.core.estimate.fading`, where there is a clock to fade by.
+just as exactly. Old samples fade in `plr.controlplane.core.estimate.fading`, where there is a clock to fade by.
 
 A sidecar has no numpy of its own, and an operator's `plr` has none at all. So only the parts that the control plane
 computes with import it, at their first use.
@@ -26,7 +26,7 @@ from bisect import bisect_right
 from operator import lt
 from typing import TYPE_CHECKING
 
-from protos.base.errors import DecodeError
+from plr.protos.base.errors import DecodeError
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence

@@ -8,14 +8,14 @@ printable bytes.
 
 from __future__ import annotations
 
-from protos.convert.admin import (
+from plr.protos.convert.admin import (
     own_revocations_from_proto,
     status_from_proto,
     status_query_from_proto,
     status_query_to_proto,
     status_to_proto,
 )
-from protos.convert.control import (
+from plr.protos.convert.control import (
     control_message_from_proto,
     control_message_to_proto,
     parse_control_message,
@@ -25,7 +25,7 @@ from protos.convert.control import (
     sidecar_message_from_proto,
     sidecar_message_to_proto,
 )
-from protos.convert.events import (
+from plr.protos.convert.events import (
     departed_from_proto,
     departed_to_proto,
     event_list_from_proto,
@@ -36,10 +36,10 @@ from protos.convert.events import (
     log_state_from_proto,
     log_state_to_proto,
 )
-from protos.convert.explanation import explain_request_from_proto, explanation_from_proto, explanation_to_proto
-from protos.convert.mapping import mapping_set_from_proto, mapping_set_to_proto
-from protos.convert.reports import report_from_proto, report_to_proto
-from protos.convert.types import (
+from plr.protos.convert.explanation import explain_request_from_proto, explanation_from_proto, explanation_to_proto
+from plr.protos.convert.mapping import mapping_set_from_proto, mapping_set_to_proto
+from plr.protos.convert.reports import report_from_proto, report_to_proto
+from plr.protos.convert.types import (
     address_from_proto,
     address_to_proto,
     candidate_from_proto,

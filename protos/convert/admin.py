@@ -5,9 +5,9 @@ from __future__ import annotations
 import dataclasses
 from typing import TYPE_CHECKING
 
-from protos.base.errors import DecodeError
-from protos.convert.control import revocations_from_proto, revocations_to_proto
-from protos.convert.fields import (
+from plr.protos.base.errors import DecodeError
+from plr.protos.convert.control import revocations_from_proto, revocations_to_proto
+from plr.protos.convert.fields import (
     MAX_MAPPED_SERVICES,
     MAX_OFFERS,
     MAX_SIDECARS,
@@ -19,9 +19,9 @@ from protos.convert.fields import (
     unique,
     version,
 )
-from protos.convert.mapping import service_mapping_from_proto, service_mapping_to_proto
-from protos.convert.reports import path_from_proto, path_to_proto
-from protos.convert.types import (
+from plr.protos.convert.mapping import service_mapping_from_proto, service_mapping_to_proto
+from plr.protos.convert.reports import path_from_proto, path_to_proto
+from plr.protos.convert.types import (
     interface_names,
     peer_from_proto,
     peer_to_proto,
@@ -29,16 +29,16 @@ from protos.convert.types import (
     use_from_proto,
     use_to_proto,
 )
-from protos.model.members import MAX_UNMET, NO_REVOCATIONS, RevocationSet
-from protos.model.names import clean_text, node_name, text
-from protos.model.report import MAX_PATHS
-from protos.model.status import ResourceStatus, SidecarStatus, StatusQuery, SyncState
-from protos.plr.v1 import admin_pb2
+from plr.protos.model.members import MAX_UNMET, NO_REVOCATIONS, RevocationSet
+from plr.protos.model.names import clean_text, node_name, text
+from plr.protos.model.report import MAX_PATHS
+from plr.protos.model.status import ResourceStatus, SidecarStatus, StatusQuery, SyncState
+from plr.protos.plr.v1 import admin_pb2
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterable
 
-    from protos.model.ids import ServiceName
+    from plr.protos.model.ids import ServiceName
 
 _SYNC_STATES = {
     admin_pb2.SYNC_STATE_NOT_SENT: SyncState.NOT_SENT,

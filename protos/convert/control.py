@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING, assert_never
 
 from google.protobuf.message import DecodeError as ProtobufDecodeError
 
-from protos.base.errors import DecodeError, UnknownKindError
-from protos.convert.fields import (
+from plr.protos.base.errors import DecodeError, UnknownKindError
+from plr.protos.convert.fields import (
     MAX_CRL_BYTES,
     MAX_REMOVED,
     MAX_STUN_SERVERS,
@@ -19,10 +19,10 @@ from protos.convert.fields import (
     unique,
     version,
 )
-from protos.convert.mapping import mapping_set_from_proto, mapping_set_to_proto
-from protos.convert.message_cost import check_cost
-from protos.convert.reports import report_from_proto, report_parts, report_to_proto
-from protos.convert.types import (
+from plr.protos.convert.mapping import mapping_set_from_proto, mapping_set_to_proto
+from plr.protos.convert.message_cost import check_cost
+from plr.protos.convert.reports import report_from_proto, report_parts, report_to_proto
+from plr.protos.convert.types import (
     announced_from_proto,
     candidate_to_proto,
     credential_from_proto,
@@ -41,8 +41,8 @@ from protos.convert.types import (
     use_from_proto,
     use_to_proto,
 )
-from protos.model.mapping import MappingSet
-from protos.model.members import (
+from plr.protos.model.mapping import MappingSet
+from plr.protos.model.members import (
     MAX_PEERS,
     MAX_UNMET,
     TOKEN_BYTES,
@@ -55,11 +55,11 @@ from protos.model.members import (
     RevocationSet,
     ServiceSet,
 )
-from protos.model.names import clean_text, domain_label, node_name, text
-from protos.model.report import Report
-from protos.model.stream import Ack, ControlMessage, Drain, Heartbeat, Nack, ResourceKind, SidecarMessage, Welcome
-from protos.plr.v1 import control_pb2
-from protos.trust.identity import MAX_CA_CERTIFICATES
+from plr.protos.model.names import clean_text, domain_label, node_name, text
+from plr.protos.model.report import Report
+from plr.protos.model.stream import Ack, ControlMessage, Drain, Heartbeat, Nack, ResourceKind, SidecarMessage, Welcome
+from plr.protos.plr.v1 import control_pb2
+from plr.protos.trust.identity import MAX_CA_CERTIFICATES
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

@@ -4,11 +4,19 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from protos.convert.fields import MAX_DURATION_S, MAX_EVENTS, US_PER_S, at_most, each, known, microseconds
-from protos.convert.types import role_from_proto, role_to_proto, service_names
-from protos.model.fleet_events import DepartedSidecar, EventKind, EventList, EventLogState, EventQuery, FleetEvent, Why
-from protos.model.names import clean_text, node_name, text
-from protos.plr.v1 import admin_pb2, types_pb2
+from plr.protos.convert.fields import MAX_DURATION_S, MAX_EVENTS, US_PER_S, at_most, each, known, microseconds
+from plr.protos.convert.types import role_from_proto, role_to_proto, service_names
+from plr.protos.model.fleet_events import (
+    DepartedSidecar,
+    EventKind,
+    EventList,
+    EventLogState,
+    EventQuery,
+    FleetEvent,
+    Why,
+)
+from plr.protos.model.names import clean_text, node_name, text
+from plr.protos.plr.v1 import admin_pb2, types_pb2
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

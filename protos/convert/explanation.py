@@ -5,10 +5,10 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING, Literal
 
-from protos.base.errors import DecodeError
-from protos.convert.admin import resource_from_proto, resource_to_proto
-from protos.convert.events import why_from_proto, why_to_proto
-from protos.convert.fields import (
+from plr.protos.base.errors import DecodeError
+from plr.protos.convert.admin import resource_from_proto, resource_to_proto
+from plr.protos.convert.events import why_from_proto, why_to_proto
+from plr.protos.convert.fields import (
     MAX_ASSIGNMENTS,
     MAX_DURATION_S,
     MAX_EVENTS,
@@ -21,14 +21,14 @@ from protos.convert.fields import (
     probability,
     version,
 )
-from protos.convert.mapping import (
+from plr.protos.convert.mapping import (
     assignment_from_proto,
     assignment_to_proto,
     service_mapping_from_proto,
     service_mapping_to_proto,
 )
-from protos.convert.types import histogram_from_proto, histogram_to_proto
-from protos.model.explanation import (
+from plr.protos.convert.types import histogram_from_proto, histogram_to_proto
+from plr.protos.model.explanation import (
     Alternative,
     AlternativeKind,
     Belief,
@@ -38,12 +38,12 @@ from protos.model.explanation import (
     MappingChange,
     PairExplanation,
 )
-from protos.model.names import clean_text, interface_name, node_name, service_name, text
-from protos.model.report import MAX_JOINTS
-from protos.plr.v1 import admin_pb2
+from plr.protos.model.names import clean_text, interface_name, node_name, service_name, text
+from plr.protos.model.report import MAX_JOINTS
+from plr.protos.plr.v1 import admin_pb2
 
 if TYPE_CHECKING:
-    from protos.model.ids import NodeName, ServiceName
+    from plr.protos.model.ids import NodeName, ServiceName
 
 MAX_PAIRS = 4096
 """Pairs in one explanation."""

@@ -5,8 +5,8 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING, TypeVar
 
-from protos.base.errors import DecodeError
-from protos.model.ids import MAX_VERSION, Version
+from plr.protos.base.errors import DecodeError
+from plr.protos.model.ids import MAX_VERSION, Version
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from protos.convert.fields import MAX_ASSIGNMENTS, MAX_MAPPED_SERVICES, each, probability, unique, version
-from protos.model.mapping import Assignment, MappingSet, ServiceMapping
-from protos.model.names import clean_text, interface_name, node_name, service_name, text
-from protos.plr.v1 import control_pb2
+from plr.protos.convert.fields import MAX_ASSIGNMENTS, MAX_MAPPED_SERVICES, each, probability, unique, version
+from plr.protos.model.mapping import Assignment, MappingSet, ServiceMapping
+from plr.protos.model.names import clean_text, interface_name, node_name, service_name, text
+from plr.protos.plr.v1 import control_pb2
 
 
 def mapping_set_from_proto(message: control_pb2.MappingSet) -> MappingSet:

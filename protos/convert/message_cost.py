@@ -6,12 +6,12 @@ seconds and fill its memory. So the fields are counted first.
 
 from __future__ import annotations
 
-from protos.base.errors import DecodeError
-from protos.convert.fields import MAX_CANDIDATES, MAX_OFFERS, MAX_OUTCOMES, MAX_USES
-from protos.model.members import MAX_UNMET
-from protos.model.report import MAX_GOODBYES, MAX_JOINTS, MAX_LATENCIES, MAX_PATHS, MAX_PENALTIES
-from protos.plr.v1 import control_pb2
-from protos.trust.identity import MAX_CA_CERTIFICATES
+from plr.protos.base.errors import DecodeError
+from plr.protos.convert.fields import MAX_CANDIDATES, MAX_OFFERS, MAX_OUTCOMES, MAX_USES
+from plr.protos.model.members import MAX_UNMET
+from plr.protos.model.report import MAX_GOODBYES, MAX_JOINTS, MAX_LATENCIES, MAX_PATHS, MAX_PENALTIES
+from plr.protos.plr.v1 import control_pb2
+from plr.protos.trust.identity import MAX_CA_CERTIFICATES
 
 CHEAP_BYTES = 4096
 """A message no longer than this is cheap whatever it holds."""

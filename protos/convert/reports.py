@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
-from protos.base.errors import DecodeError
-from protos.base.size_class import SIZE_CLASSES
-from protos.convert.fields import (
+from plr.protos.base.errors import DecodeError
+from plr.protos.base.size_class import SIZE_CLASSES
+from plr.protos.convert.fields import (
     MAX_EVENTS,
     MAX_OUTCOMES,
     at_most,
@@ -17,10 +17,10 @@ from protos.convert.fields import (
     microseconds,
     unique,
 )
-from protos.convert.mapping import assignment_from_proto, assignment_to_proto
-from protos.convert.types import histogram_from_proto, histogram_to_proto
-from protos.model.names import interface_name, node_name, service_name
-from protos.model.report import (
+from plr.protos.convert.mapping import assignment_from_proto, assignment_to_proto
+from plr.protos.convert.types import histogram_from_proto, histogram_to_proto
+from plr.protos.model.names import interface_name, node_name, service_name
+from plr.protos.model.report import (
     MAX_GOODBYES,
     MAX_JOINTS,
     MAX_LATENCIES,
@@ -34,12 +34,12 @@ from protos.model.report import (
     PenaltyReport,
     Report,
 )
-from protos.plr.v1 import control_pb2
+from plr.protos.plr.v1 import control_pb2
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from protos.model.ids import NodeName
+    from plr.protos.model.ids import NodeName
 
 PART_ENTRIES = 32
 """Entries in one part; with their processing they take some 2 ms."""

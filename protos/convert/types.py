@@ -6,9 +6,9 @@ from collections import Counter
 from ipaddress import IPv4Address, IPv6Address, ip_address
 from typing import TYPE_CHECKING
 
-from protos.base.errors import DecodeError
-from protos.base.histogram import BUCKETS, LAYOUT, Histogram
-from protos.convert.fields import (
+from plr.protos.base.errors import DecodeError
+from plr.protos.base.histogram import BUCKETS, LAYOUT, Histogram
+from plr.protos.convert.fields import (
     MAX_CANDIDATES,
     MAX_CAPACITY,
     MAX_COPIES,
@@ -22,8 +22,8 @@ from protos.convert.fields import (
     probability,
     unique,
 )
-from protos.model.ids import Address, InterfaceId, InterfaceName, Role, ServiceName, SessionId
-from protos.model.members import (
+from plr.protos.model.ids import Address, InterfaceId, InterfaceName, Role, ServiceName, SessionId
+from plr.protos.model.members import (
     ALL_CALLS,
     MAX_CANDIDATES_OF_INTERFACE,
     MAX_CREDENTIAL_BYTES,
@@ -38,9 +38,9 @@ from protos.model.members import (
     ServiceOffer,
     ServiceUse,
 )
-from protos.model.names import domain_label, interface_name, node_name, service_name, type_name
-from protos.model.redundancy_mode import DEFAULT_HEDGE_QUANTILE, RedundancyMode
-from protos.plr.v1 import types_pb2
+from plr.protos.model.names import domain_label, interface_name, node_name, service_name, type_name
+from plr.protos.model.redundancy_mode import DEFAULT_HEDGE_QUANTILE, RedundancyMode
+from plr.protos.plr.v1 import types_pb2
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

@@ -11,11 +11,11 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from protos.base.histogram import Histogram
-    from protos.model.fleet_events import Why
-    from protos.model.ids import InterfaceName, NodeName, ServiceName, Version
-    from protos.model.mapping import Assignment, ServiceMapping
-    from protos.model.status import ResourceStatus
+    from plr.protos.base.histogram import Histogram
+    from plr.protos.model.fleet_events import Why
+    from plr.protos.model.ids import InterfaceName, NodeName, ServiceName, Version
+    from plr.protos.model.mapping import Assignment, ServiceMapping
+    from plr.protos.model.status import ResourceStatus
 
 SAMPLE = 1000
 """Weight of a sample that has not faded in a histogram."""

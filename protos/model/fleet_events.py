@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from protos.model.ids import NodeName, Role, ServiceName
+    from plr.protos.model.ids import NodeName, Role, ServiceName
 
 
 class Why(enum.Enum):

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from protos.model.ids import InterfaceName, NodeName, ServiceName, Version
+    from plr.protos.model.ids import InterfaceName, NodeName, ServiceName, Version
 
 
 @dataclass(frozen=True, slots=True)

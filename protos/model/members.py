@@ -10,7 +10,7 @@ import enum
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, NamedTuple
 
-from protos.model.ids import (
+from plr.protos.model.ids import (
     NO_VERSION,
     Address,
     InterfaceId,
@@ -21,7 +21,7 @@ from protos.model.ids import (
     SessionId,
     Version,
 )
-from protos.model.redundancy_mode import DEFAULT_HEDGE_QUANTILE, RedundancyMode
+from plr.protos.model.redundancy_mode import DEFAULT_HEDGE_QUANTILE, RedundancyMode
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

@@ -5,8 +5,8 @@ from __future__ import annotations
 import re
 from functools import lru_cache
 
-from protos.base.errors import DecodeError
-from protos.model.ids import InterfaceName, NodeName, ServiceName
+from plr.protos.base.errors import DecodeError
+from plr.protos.model.ids import InterfaceName, NodeName, ServiceName
 
 MAX_STRING_BYTES = 255
 """Longest string in UTF-8; 255 is also ROS's limit for topic and service names."""

@@ -8,14 +8,14 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
-from protos.model.ids import Version
-from protos.model.members import POLICY_PENDING
+from plr.protos.model.ids import Version
+from plr.protos.model.members import POLICY_PENDING
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from protos.model.ids import NodeName
-    from protos.model.members import Peer, PeerSet
+    from plr.protos.model.ids import NodeName
+    from plr.protos.model.members import Peer, PeerSet
 
 
 def put_upon(held: Mapping[NodeName, Peer], changes: PeerSet) -> PeerSet:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from protos.model.ids import OLDEST_PROTOCOL_VERSION, PROTOCOL_VERSION
+from plr.protos.model.ids import OLDEST_PROTOCOL_VERSION, PROTOCOL_VERSION
 
 
 class Spoken(NamedTuple):

@@ -10,9 +10,9 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from protos.base.histogram import Histogram
-    from protos.model.ids import InterfaceName, NodeName, ServiceName
-    from protos.model.mapping import Assignment
+    from plr.protos.base.histogram import Histogram
+    from plr.protos.model.ids import InterfaceName, NodeName, ServiceName
+    from plr.protos.model.mapping import Assignment
 
 MAX_LATENCIES = 4096
 """Pairs (interface, server) in one report, counted separately for each service and size class that they carried."""
@@ -46,7 +46,7 @@ class LatencyReport:
     server: NodeName
     service: ServiceName
     size_class: int
-    """See `protos.base.size_class`."""
+    """See `plr.protos.base.size_class`."""
     network: Histogram
     """Time from sending to the answer, without the processing; lost are requests that the server never had whole."""
     called_off: Histogram

@@ -6,16 +6,16 @@ import enum
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
-from protos.model.ids import Version
-from protos.model.members import NO_REVOCATIONS, RevocationSet
+from plr.protos.model.ids import Version
+from plr.protos.model.members import NO_REVOCATIONS, RevocationSet
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from protos.model.ids import InterfaceName, NodeName, ServiceName
-    from protos.model.mapping import ServiceMapping
-    from protos.model.members import Peer, ServiceUse
-    from protos.model.report import PathReport
+    from plr.protos.model.ids import InterfaceName, NodeName, ServiceName
+    from plr.protos.model.mapping import ServiceMapping
+    from plr.protos.model.members import Peer, ServiceUse
+    from plr.protos.model.report import PathReport
 
 _NONE_YET = Version(0)
 

@@ -10,12 +10,12 @@ import enum
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
-from protos.model.mapping import MappingSet
-from protos.model.members import CandidateSet, PeerSet, Registration, RevocationSet, ServiceSet
-from protos.model.report import Report
+from plr.protos.model.mapping import MappingSet
+from plr.protos.model.members import CandidateSet, PeerSet, Registration, RevocationSet, ServiceSet
+from plr.protos.model.report import Report
 
 if TYPE_CHECKING:
-    from protos.model.ids import Version
+    from plr.protos.model.ids import Version
 
 
 class ResourceKind(enum.Enum):

@@ -5,8 +5,8 @@ from __future__ import annotations
 import argparse
 from typing import TYPE_CHECKING, NoReturn, TypeVar
 
-from protos.base.errors import DecodeError
-from protos.base.printable import escaped
+from plr.protos.base.errors import DecodeError
+from plr.protos.base.printable import escaped
 
 if TYPE_CHECKING:
     from collections.abc import Callable

@@ -5,11 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from protos.base.durations import in_words
-from protos.trust.identity import EXPIRED, NOT_YET_VALID, REVOKED, CertificateError
+from plr.protos.base.durations import in_words
+from plr.protos.trust.identity import EXPIRED, NOT_YET_VALID, REVOKED, CertificateError
 
 if TYPE_CHECKING:
-    from protos.program.tls_files import TlsFiles
+    from plr.protos.program.tls_files import TlsFiles
 
 SOON_S = 7 * 86_400.0
 """How long before its end a certificate gets a warning; the alert in deploy/prometheus fires as early."""

@@ -11,7 +11,7 @@ import sys
 from importlib.metadata import entry_points
 from typing import TYPE_CHECKING
 
-from protos.program import endings, extras
+from plr.protos.program import endings, extras
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

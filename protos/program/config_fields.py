@@ -8,7 +8,7 @@ from typing import Annotated
 
 from pydantic import AfterValidator, BeforeValidator
 
-from protos.base.host_port import canonical_ip, check_remote, split_host_port
+from plr.protos.base.host_port import canonical_ip, check_remote, split_host_port
 
 
 def refuse_duplicates(values: tuple[str, ...]) -> tuple[str, ...]:

@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import yaml
 from pydantic import BaseModel, ValidationError
 
-from protos.base.errors import ConfigError
-from protos.program.regular_file import read_regular
+from plr.protos.base.errors import ConfigError
+from plr.protos.program.regular_file import read_regular
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping

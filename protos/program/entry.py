@@ -28,6 +28,6 @@ def plr() -> int:
     """Run `plr` and return its exit code."""
     end_by_ctrl_c()
     let_the_system_find_names()
-    from protos.program.command_line import main
+    from plr.protos.program.command_line import main
 
     return main()

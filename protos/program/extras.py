@@ -7,7 +7,7 @@ import importlib.util
 import sys
 from typing import TYPE_CHECKING
 
-from protos.program.endings import ended_by_ctrl_c
+from plr.protos.program.endings import ended_by_ctrl_c
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
@@ -18,7 +18,7 @@ CONTROL_PLANE = ("grpc_health", "grpc_reflection", "numpy", "ortools", "promethe
 PLAN = ("numpy",)
 
 EXIT_MISSING = 2
-_OURS = frozenset({"protos", "sidecar", "controlplane"})
+_OURS = "plr"
 
 
 def missing(extra: str, modules: Sequence[str]) -> str | None:
@@ -40,7 +40,7 @@ def required(program: str, extra: str) -> Iterator[None]:
             yield
     except ModuleNotFoundError as error:
         name = (error.name or "").partition(".")[0]
-        if not name or name in _OURS:
+        if not name or name == _OURS:
             raise
         sys.stderr.write(f"{program}: {advice(extra, [name])}\n")
         sys.exit(EXIT_MISSING)

@@ -11,7 +11,7 @@ import os
 import time
 from typing import TYPE_CHECKING
 
-from protos.base.printable import escaped
+from plr.protos.base.printable import escaped
 
 if TYPE_CHECKING:
     from typing import TextIO

@@ -94,7 +94,7 @@ class Logging:
         waiting: queue.Queue[logging.LogRecord | None] = queue.Queue(max_waiting)
         self._handler = _BoundedQueueHandler(waiting)
         self._listener = _PatientListener(waiting, output)
-        self._packages = (package, "protos")
+        self._packages = (package, "plr.protos")
         self._level = level.upper()
 
     def __enter__(self) -> None:

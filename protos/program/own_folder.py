@@ -14,7 +14,7 @@ import stat
 from pathlib import Path
 from typing import IO, TYPE_CHECKING
 
-from protos.program.regular_file import refuse_irregular
+from plr.protos.program.regular_file import refuse_irregular
 
 if TYPE_CHECKING:
     from collections.abc import Container

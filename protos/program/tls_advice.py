@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from protos.program.certificate_term import remedy
-from protos.trust.identity import CONTROL_PLANE_DNS, CertificateError
+from plr.protos.program.certificate_term import remedy
+from plr.protos.trust.identity import CONTROL_PLANE_DNS, CertificateError
 
 if TYPE_CHECKING:
-    from protos.program.tls_files import TlsFiles
+    from plr.protos.program.tls_files import TlsFiles
 
 _SEE_LOG = "its log tells more"
 

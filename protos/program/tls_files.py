@@ -21,9 +21,9 @@ from cryptography import x509
 from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.hazmat.primitives.serialization import Encoding, load_pem_private_key
 
-from protos.base.errors import ConfigError
-from protos.program.regular_file import open_regular
-from protos.trust.identity import CertificateError, Identity, IdentityRole, Trust
+from plr.protos.base.errors import ConfigError
+from plr.protos.program.regular_file import open_regular
+from plr.protos.trust.identity import CertificateError, Identity, IdentityRole, Trust
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -6,8 +6,8 @@ import argparse
 import sys
 from typing import TYPE_CHECKING, Any
 
-from protos.model.ids import PROTOCOL_VERSION
-from protos.program import commit
+from plr.protos.model.ids import PROTOCOL_VERSION
+from plr.protos.program import commit
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

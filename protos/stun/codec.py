@@ -45,10 +45,10 @@ from dataclasses import dataclass
 from ipaddress import IPv4Address, IPv6Address, ip_address
 from typing import TYPE_CHECKING
 
-from protos.base.errors import DecodeError
+from plr.protos.base.errors import DecodeError
 
 if TYPE_CHECKING:
-    from protos.model.ids import Address
+    from plr.protos.model.ids import Address
 
 MAGIC_COOKIE = 0x2112A442
 HEADER_BYTES = 20

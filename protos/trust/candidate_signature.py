@@ -18,15 +18,15 @@ from typing import TYPE_CHECKING
 
 from cryptography.exceptions import InvalidSignature
 
-from protos.model.members import CandidateKind
-from protos.trust.credential import SIGNATURE_ALGORITHM, signer_key
-from protos.trust.identity import UNTRUSTED, CertificateError
+from plr.protos.model.members import CandidateKind
+from plr.protos.trust.credential import SIGNATURE_ALGORITHM, signer_key
+from plr.protos.trust.identity import UNTRUSTED, CertificateError
 
 if TYPE_CHECKING:
     from cryptography.hazmat.primitives.asymmetric import ec
 
-    from protos.model.ids import SessionId
-    from protos.model.members import Candidate
+    from plr.protos.model.ids import SessionId
+    from plr.protos.model.members import Candidate
 
 _LABEL = b"plr candidates\0"
 _HEAD = struct.Struct(">QQH")

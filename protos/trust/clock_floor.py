@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from protos.trust.identity import Trust
+    from plr.protos.trust.identity import Trust
 
 SLACK_S = 300.0
 """A clock behind by no more than this is only corrected slightly; `plr ca` backdates certificates by as much."""

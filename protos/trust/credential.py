@@ -25,11 +25,11 @@ from cryptography.hazmat.primitives import hashes
 from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.x509 import load_der_x509_certificate
 
-from protos.base.errors import DecodeError
-from protos.model.ids import NodeName, Role, SessionId
-from protos.model.members import MAX_CREDENTIAL_BYTES
-from protos.model.names import node_name
-from protos.trust.identity import MALFORMED, UNTRUSTED, WRONG_ROLE, CertificateError, Identity, IdentityRole
+from plr.protos.base.errors import DecodeError
+from plr.protos.model.ids import NodeName, Role, SessionId
+from plr.protos.model.members import MAX_CREDENTIAL_BYTES
+from plr.protos.model.names import node_name
+from plr.protos.trust.identity import MALFORMED, UNTRUSTED, WRONG_ROLE, CertificateError, Identity, IdentityRole
 
 if TYPE_CHECKING:
     from collections.abc import Callable

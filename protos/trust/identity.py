@@ -25,12 +25,12 @@ from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.hazmat.primitives.serialization import Encoding
 from cryptography.x509.oid import ExtendedKeyUsageOID, SignatureAlgorithmOID
 
-from protos.base.durations import in_words
-from protos.base.errors import DecodeError
-from protos.model.names import node_name
+from plr.protos.base.durations import in_words
+from plr.protos.base.errors import DecodeError
+from plr.protos.model.names import node_name
 
 if TYPE_CHECKING:
-    from protos.model.ids import NodeName
+    from plr.protos.model.ids import NodeName
 
 CONTROL_PLANE_DNS = "controlplane.plr.internal"
 """The name that every client requires in the control plane's certificate, whatever address it was reached at."""

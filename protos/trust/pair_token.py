@@ -13,11 +13,11 @@ from __future__ import annotations
 import hmac
 from typing import TYPE_CHECKING
 
-from protos.model.ids import Role
-from protos.model.members import TOKEN_BYTES
+from plr.protos.model.ids import Role
+from plr.protos.model.members import TOKEN_BYTES
 
 if TYPE_CHECKING:
-    from protos.model.ids import NodeName
+    from plr.protos.model.ids import NodeName
 
 _LABEL = b"plr 2 pair token"
 _HEADS = {Role.ROBOT: _LABEL + b"\1", Role.CLOUD: _LABEL + b"\2"}

@@ -5,12 +5,12 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING, NamedTuple
 
-from protos.model.members import HeldList, RevocationSet
+from plr.protos.model.members import HeldList, RevocationSet
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
 
-    from protos.trust.identity import RevocationList
+    from plr.protos.trust.identity import RevocationList
 
 
 MAX_NUMBER = (1 << 64) - 1

@@ -7,12 +7,12 @@ from typing import Annotated
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, PlainValidator, WithJsonSchema
 
-from protos.base.errors import DecodeError
-from protos.base.host_port import check_remote
-from protos.convert.fields import MAX_COPIES
-from protos.model.members import AT_MOST_EVERY_INTERFACE, EVERY_INTERFACE, Copies
-from protos.model.names import domain_label, node_name
-from protos.program.config_fields import encoded_path, refuse_duplicates
+from plr.protos.base.errors import DecodeError
+from plr.protos.base.host_port import check_remote
+from plr.protos.convert.fields import MAX_COPIES
+from plr.protos.model.members import AT_MOST_EVERY_INTERFACE, EVERY_INTERFACE, Copies
+from plr.protos.model.names import domain_label, node_name
+from plr.protos.program.config_fields import encoded_path, refuse_duplicates
 
 _INTERFACE = re.compile(r"[!-.0-~]{1,15}")
 _INTERFACE_GLOB = re.compile(r"[!-.0-~]{1,64}")

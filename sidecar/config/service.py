@@ -7,11 +7,11 @@ from typing import TYPE_CHECKING, Annotated
 
 from pydantic import Field
 
-from protos.convert.fields import MAX_CHARGE
-from protos.model.ids import Role, ServiceName
-from protos.model.members import AT_MOST_EVERY_INTERFACE, DEFAULT_CHARGE, EVERY_INTERFACE
-from protos.model.redundancy_mode import DEFAULT_ADAPTIVE_TARGET, DEFAULT_HEDGE_QUANTILE, RedundancyMode
-from sidecar.config.fields import (
+from plr.protos.convert.fields import MAX_CHARGE
+from plr.protos.model.ids import Role, ServiceName
+from plr.protos.model.members import AT_MOST_EVERY_INTERFACE, DEFAULT_CHARGE, EVERY_INTERFACE
+from plr.protos.model.redundancy_mode import DEFAULT_ADAPTIVE_TARGET, DEFAULT_HEDGE_QUANTILE, RedundancyMode
+from plr.sidecar.config.fields import (
     CopiesWanted,
     DomainLabel,
     FullServiceName,
@@ -23,15 +23,15 @@ from sidecar.config.fields import (
     converted,
     is_glob,
 )
-from sidecar.core.base.values import Priority
-from sidecar.core.robot.fallback.queue import SPARE
-from sidecar.core.rules.budget import Budget
-from sidecar.core.rules.service_rule import MAX_LIFETIME_S, FallbackRule, ServiceRule
+from plr.sidecar.core.base.values import Priority
+from plr.sidecar.core.robot.fallback.queue import SPARE
+from plr.sidecar.core.rules.budget import Budget
+from plr.sidecar.core.rules.service_rule import MAX_LIFETIME_S, FallbackRule, ServiceRule
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from sidecar.core.message.repair import Redundancy
+    from plr.sidecar.core.message.repair import Redundancy
 
 MAX_DEADLINE_MS = 60_000
 """End of the latency histogram: a miss of a longer deadline could not be predicted."""
@@ -50,7 +50,7 @@ CLOUD_LIFETIME_MS = 60_000.0
 
 MAX_EXPLORATION = 0.1
 DEFAULT_EXPLORATION = 0.01
-"""Default share; its cost is bounded separately, see `sidecar.core.robot.dispatch.exploration`."""
+"""Default share; its cost is bounded separately, see `plr.sidecar.core.robot.dispatch.exploration`."""
 
 MIN_HEDGE_QUANTILE, MAX_HEDGE_QUANTILE = 0.5, 0.99
 """Below, most requests would be sent twice, which `replicate` does sooner; above, too few latencies are known."""

@@ -10,11 +10,11 @@ from typing import TYPE_CHECKING, Annotated, Any, Self
 
 from pydantic import AfterValidator, Field, model_validator
 
-from protos.base.errors import ConfigError
-from protos.base.host_port import is_loopback
-from protos.model.ids import NodeName, Role, ServiceName
-from protos.model.members import DEFAULT_CHARGE, InterfaceLabel
-from protos.program.config_fields import (
+from plr.protos.base.errors import ConfigError
+from plr.protos.base.host_port import is_loopback
+from plr.protos.model.ids import NodeName, Role, ServiceName
+from plr.protos.model.members import DEFAULT_CHARGE, InterfaceLabel
+from plr.protos.program.config_fields import (
     AbsolutePath,
     IpAddress,
     ListenAddress,
@@ -24,9 +24,9 @@ from protos.program.config_fields import (
     check_security,
     refuse_duplicates,
 )
-from protos.program.config_file import key_path, parse_yaml, read_text, validate
-from protos.trust.identity import IdentityRole
-from sidecar.config.fields import (
+from plr.protos.program.config_file import key_path, parse_yaml, read_text, validate
+from plr.protos.trust.identity import IdentityRole
+from plr.sidecar.config.fields import (
     ControlPlaneAddresses,
     DomainLabel,
     InterfacePattern,
@@ -36,16 +36,16 @@ from sidecar.config.fields import (
     converted,
     is_glob,
 )
-from sidecar.config.service import NetworkConfig, ServiceConfig
-from sidecar.core.control.ways import Price
-from sidecar.core.rules.service_rule import Rules, ServiceRule
+from plr.sidecar.config.service import NetworkConfig, ServiceConfig
+from plr.sidecar.core.control.ways import Price
+from plr.sidecar.core.rules.service_rule import Rules, ServiceRule
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator
 
-    from protos.model.ids import InterfaceName
-    from protos.trust.identity import Identity
-    from sidecar.core.rules.budget import Budget
+    from plr.protos.model.ids import InterfaceName
+    from plr.protos.trust.identity import Identity
+    from plr.sidecar.core.rules.budget import Budget
 
 DEFAULT_CLOUD_UDP_PORT = 24700
 """Fixed, as a firewall rule has to name it; below Linux's ephemeral ports (32768 and up)."""

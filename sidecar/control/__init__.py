@@ -1,1 +1,1 @@
-"""Drives `sidecar.core.control` with a control stream over gRPC."""
+"""Drives `plr.sidecar.core.control` with a control stream over gRPC."""

@@ -7,16 +7,16 @@ from collections import Counter
 from itertools import islice
 from typing import TYPE_CHECKING
 
-from protos.convert.fields import MAX_CANDIDATES
-from protos.model.members import MAX_CANDIDATES_OF_INTERFACE, CandidateSet, InterfaceLabel
-from protos.trust.candidate_signature import sign_candidates
+from plr.protos.convert.fields import MAX_CANDIDATES
+from plr.protos.model.members import MAX_CANDIDATES_OF_INTERFACE, CandidateSet, InterfaceLabel
+from plr.protos.trust.candidate_signature import sign_candidates
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator
 
-    from protos.model.ids import InterfaceName, SessionId
-    from protos.model.members import Candidate
-    from protos.program.tls_files import TlsFiles
+    from plr.protos.model.ids import InterfaceName, SessionId
+    from plr.protos.model.members import Candidate
+    from plr.protos.program.tls_files import TlsFiles
 
 log = logging.getLogger(__name__)
 

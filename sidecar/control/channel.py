@@ -6,10 +6,10 @@ from typing import TYPE_CHECKING
 
 import grpc
 
-from protos.trust.identity import CONTROL_PLANE_DNS
+from plr.protos.trust.identity import CONTROL_PLANE_DNS
 
 if TYPE_CHECKING:
-    from protos.program.tls_files import TlsFiles
+    from plr.protos.program.tls_files import TlsFiles
 
 KEEPALIVE_TIME_MS = 10_000
 """Interval of pings: they detect a control plane that hangs while its kernel acknowledges, and keep NAT bindings for

@@ -18,30 +18,30 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import grpc
 
-from protos.base.errors import DecodeError, UnknownKindError
-from protos.convert import control_message_from_proto, sidecar_message_to_proto
-from protos.model.members import PeerSet, ServiceSet
-from protos.model.names import clean_text
-from protos.model.report import Report
-from protos.model.stream import ResourceKind, Welcome
-from protos.plr.v1 import control_pb2_grpc
-from protos.program import tls_advice
-from sidecar.control.channel import REFUSALS, open_channel
-from sidecar.control.outage_log import OutageLog
-from sidecar.control.refusal_log import RefusalLog
-from sidecar.core.control.session import Apply
-from sidecar.core.control.watch import CHEAPER
+from plr.protos.base.errors import DecodeError, UnknownKindError
+from plr.protos.convert import control_message_from_proto, sidecar_message_to_proto
+from plr.protos.model.members import PeerSet, ServiceSet
+from plr.protos.model.names import clean_text
+from plr.protos.model.report import Report
+from plr.protos.model.stream import ResourceKind, Welcome
+from plr.protos.plr.v1 import control_pb2_grpc
+from plr.protos.program import tls_advice
+from plr.sidecar.control.channel import REFUSALS, open_channel
+from plr.sidecar.control.outage_log import OutageLog
+from plr.sidecar.control.refusal_log import RefusalLog
+from plr.sidecar.core.control.session import Apply
+from plr.sidecar.core.control.watch import CHEAPER
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from protos.model.members import CandidateSet, RevocationSet
-    from protos.plr.v1 import control_pb2
-    from protos.program.tls_files import TlsWatch
-    from sidecar.control.hooks import ControlHooks
-    from sidecar.core.base.report_scope import ReportScope
-    from sidecar.core.control.session import ControlSession, ControlStats
-    from sidecar.net.control_dialer import ControlDialer, ControlLine
+    from plr.protos.model.members import CandidateSet, RevocationSet
+    from plr.protos.plr.v1 import control_pb2
+    from plr.protos.program.tls_files import TlsWatch
+    from plr.sidecar.control.hooks import ControlHooks
+    from plr.sidecar.core.base.report_scope import ReportScope
+    from plr.sidecar.core.control.session import ControlSession, ControlStats
+    from plr.sidecar.net.control_dialer import ControlDialer, ControlLine
 
     _Call = grpc.aio.StreamStreamCall[control_pb2.SidecarMessage, control_pb2.ControlMessage]
 

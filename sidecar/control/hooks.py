@@ -5,12 +5,12 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Protocol
 
 if TYPE_CHECKING:
-    from protos.model.mapping import MappingSet
-    from protos.model.members import PeerSet
-    from protos.model.report import Report
-    from protos.model.stream import Welcome
-    from protos.program.tls_files import TlsFiles
-    from sidecar.core.base.report_scope import ReportScope
+    from plr.protos.model.mapping import MappingSet
+    from plr.protos.model.members import PeerSet
+    from plr.protos.model.report import Report
+    from plr.protos.model.stream import Welcome
+    from plr.protos.program.tls_files import TlsFiles
+    from plr.sidecar.core.base.report_scope import ReportScope
 
 
 class ControlHooks(Protocol):

@@ -6,7 +6,7 @@ import logging
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from protos.model.stream import ResourceKind
+    from plr.protos.model.stream import ResourceKind
 
 
 class RefusalLog:

@@ -12,17 +12,17 @@ from collections import deque
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Protocol
 
-from protos.convert.fields import MAX_CRL_BYTES
-from protos.trust.identity import CertificateError
-from protos.trust.revocation_views import revocation_set
+from plr.protos.convert.fields import MAX_CRL_BYTES
+from plr.protos.trust.identity import CertificateError
+from plr.protos.trust.revocation_views import revocation_set
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
 
-    from protos.model.ids import NodeName
-    from protos.model.members import RevocationSet
-    from protos.program.tls_files import TlsWatch
-    from protos.trust.identity import RevocationList
+    from plr.protos.model.ids import NodeName
+    from plr.protos.model.members import RevocationSet
+    from plr.protos.program.tls_files import TlsWatch
+    from plr.protos.trust.identity import RevocationList
 
 log = logging.getLogger(__name__)
 

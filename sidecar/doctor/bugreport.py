@@ -30,21 +30,21 @@ from typing import TYPE_CHECKING
 
 import yaml
 
-from protos.base.errors import ConfigError
-from protos.base.host_port import split_host_port
-from protos.base.printable import escaped
-from protos.program import commit
-from protos.program.config_file import parse_yaml, read_text
-from sidecar.config.sidecar import SidecarConfig
-from sidecar.doctor.command import as_json, as_text
-from sidecar.doctor.examination import examine
-from sidecar.doctor.options import parser_of, where_of
-from sidecar.doctor.scrub import scrubbed, scrubbed_value
+from plr.protos.base.errors import ConfigError
+from plr.protos.base.host_port import split_host_port
+from plr.protos.base.printable import escaped
+from plr.protos.program import commit
+from plr.protos.program.config_file import parse_yaml, read_text
+from plr.sidecar.config.sidecar import SidecarConfig
+from plr.sidecar.doctor.command import as_json, as_text
+from plr.sidecar.doctor.examination import examine
+from plr.sidecar.doctor.options import parser_of, where_of
+from plr.sidecar.doctor.scrub import scrubbed, scrubbed_value
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
-    from sidecar.doctor.examination import Examination, Where
+    from plr.sidecar.doctor.examination import Examination, Where
 
 EXIT_OK = 0
 EXIT_FAILURE = 1

@@ -18,16 +18,16 @@ import sys
 from collections import Counter
 from typing import TYPE_CHECKING, Any
 
-from protos.base.printable import escaped
-from sidecar.doctor.examination import examine
-from sidecar.doctor.finding import Level
-from sidecar.doctor.options import parser_of, where_of
+from plr.protos.base.printable import escaped
+from plr.sidecar.doctor.examination import examine
+from plr.sidecar.doctor.finding import Level
+from plr.sidecar.doctor.options import parser_of, where_of
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
 
-    from sidecar.doctor.examination import Examination
-    from sidecar.doctor.finding import Finding
+    from plr.sidecar.doctor.examination import Examination
+    from plr.sidecar.doctor.finding import Finding
 
 EXIT_OK = 0
 EXIT_FAILURE = 1

@@ -10,33 +10,33 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from protos.base.errors import ConfigError, DecodeError
-from protos.model.ids import NodeName, ServiceName
-from protos.program.config_file import parse_yaml, read_text
-from protos.program.regular_file import read_regular
-from protos.program.tls_files import load_tls_files
-from protos.trust.identity import Identity, IdentityRole
-from sidecar.config.sidecar import load_config
-from sidecar.core.rules.service_rule import Rules
-from sidecar.doctor import host, node_checks, running_checks
-from sidecar.doctor.finding import fail, ok, warn
-from sidecar.doctor.running_checks import Pinged
-from sidecar.local.client import LocalBusyError, LocalClient, LocalError, LocalRefusedError
-from sidecar.local.protocol import MAX_REQUESTS
-from sidecar.net.interfaces import choose, list_interfaces
-from sidecar.ros import environment
-from sidecar.ros.errors import RosBridgeError
-from sidecar.state.file import MAX_FILE_BYTES, decode_clock_floor, decode_last_good
-from sidecar.state.store import CLOCK_FILE, LAST_GOOD_FILE
+from plr.protos.base.errors import ConfigError, DecodeError
+from plr.protos.model.ids import NodeName, ServiceName
+from plr.protos.program.config_file import parse_yaml, read_text
+from plr.protos.program.regular_file import read_regular
+from plr.protos.program.tls_files import load_tls_files
+from plr.protos.trust.identity import Identity, IdentityRole
+from plr.sidecar.config.sidecar import load_config
+from plr.sidecar.core.rules.service_rule import Rules
+from plr.sidecar.doctor import host, node_checks, running_checks
+from plr.sidecar.doctor.finding import fail, ok, warn
+from plr.sidecar.doctor.running_checks import Pinged
+from plr.sidecar.local.client import LocalBusyError, LocalClient, LocalError, LocalRefusedError
+from plr.sidecar.local.protocol import MAX_REQUESTS
+from plr.sidecar.net.interfaces import choose, list_interfaces
+from plr.sidecar.ros import environment
+from plr.sidecar.ros.errors import RosBridgeError
+from plr.sidecar.state.file import MAX_FILE_BYTES, decode_clock_floor, decode_last_good
+from plr.sidecar.state.store import CLOCK_FILE, LAST_GOOD_FILE
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping
     from typing import TypeVar
 
-    from protos.program.tls_files import TlsFiles
-    from sidecar.config.sidecar import SidecarConfig
-    from sidecar.doctor.finding import Finding
-    from sidecar.doctor.running_checks import PathKey
+    from plr.protos.program.tls_files import TlsFiles
+    from plr.sidecar.config.sidecar import SidecarConfig
+    from plr.sidecar.doctor.finding import Finding
+    from plr.sidecar.doctor.running_checks import PathKey
 
     T = TypeVar("T")
 
@@ -285,7 +285,7 @@ def _types_last_offered(config: SidecarConfig) -> dict[str, str]:
 
 def _is_installed(kind: str) -> bool:
     try:
-        from sidecar.ros.types import load_service_type
+        from plr.sidecar.ros.types import load_service_type
 
         load_service_type(kind)
     except (ImportError, RosBridgeError):

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from protos.program.regular_file import open_regular
+from plr.protos.program.regular_file import open_regular
 
 if TYPE_CHECKING:
     from collections.abc import Container

@@ -4,18 +4,18 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from protos.program.certificate_term import term_problem
-from protos.trust.clock_floor import SLACK_S
-from sidecar.doctor.finding import duration, fail, ok, warn
+from plr.protos.program.certificate_term import term_problem
+from plr.protos.trust.clock_floor import SLACK_S
+from plr.sidecar.doctor.finding import duration, fail, ok, warn
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
 
-    from protos.program.tls_files import TlsFiles
-    from protos.trust.identity import Identity
-    from sidecar.doctor.finding import Finding
-    from sidecar.doctor.host import ClockState
-    from sidecar.net.interfaces import InterfaceChoice
+    from plr.protos.program.tls_files import TlsFiles
+    from plr.protos.trust.identity import Identity
+    from plr.sidecar.doctor.finding import Finding
+    from plr.sidecar.doctor.host import ClockState
+    from plr.sidecar.net.interfaces import InterfaceChoice
 
 SECONDS_PER_DAY = 86_400.0
 STRICT = 1
@@ -108,7 +108,7 @@ def clock(now_wall: float, floor: float, state: ClockState | None) -> Iterator[F
 
 
 def ros(environment: Mapping[str, str], shell: Mapping[str, str], problem: str | None) -> Iterator[Finding]:
-    """Judge ROS by the sidecar's `environment`; `problem` is what `sidecar.ros.environment` found."""
+    """Judge ROS by the sidecar's `environment`; `problem` is what `plr.sidecar.ros.environment` found."""
     if problem is not None:
         remedy = (
             "mend the environment of the unit (/etc/plr/sidecar.env) or here: docs/start/install.md, ROS on the host"

@@ -5,8 +5,8 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from protos.program.arguments import OneLineParser
-from sidecar.doctor.examination import DEFAULT_CONFIG, Where
+from plr.protos.program.arguments import OneLineParser
+from plr.sidecar.doctor.examination import DEFAULT_CONFIG, Where
 
 
 def parser_of(program: str, about: str | None) -> argparse.ArgumentParser:

@@ -21,25 +21,25 @@ import time
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
-from protos.base.errors import ConfigError, DecodeError
-from protos.base.printable import escaped
-from protos.model.names import interface_name, node_name
-from protos.program.arguments import checked, number, whole
-from sidecar.core.link.pinging import LEAST_BYTES
-from sidecar.core.wire.frame import MAX_DATAGRAM_BYTES
-from sidecar.doctor.examination import connect, read_config
-from sidecar.doctor.finding import share
-from sidecar.doctor.options import parser_of, where_of
-from sidecar.local.client import LocalBusyError, LocalError, refusal
+from plr.protos.base.errors import ConfigError, DecodeError
+from plr.protos.base.printable import escaped
+from plr.protos.model.names import interface_name, node_name
+from plr.protos.program.arguments import checked, number, whole
+from plr.sidecar.core.link.pinging import LEAST_BYTES
+from plr.sidecar.core.wire.frame import MAX_DATAGRAM_BYTES
+from plr.sidecar.doctor.examination import connect, read_config
+from plr.sidecar.doctor.finding import share
+from plr.sidecar.doctor.options import parser_of, where_of
+from plr.sidecar.local.client import LocalBusyError, LocalError, refusal
 
 if TYPE_CHECKING:
     import argparse
     from collections.abc import Callable, Sequence
 
-    from protos.model.ids import InterfaceName
-    from sidecar.config.sidecar import SidecarConfig
-    from sidecar.doctor.examination import Where
-    from sidecar.local.client import LocalClient
+    from plr.protos.model.ids import InterfaceName
+    from plr.sidecar.config.sidecar import SidecarConfig
+    from plr.sidecar.doctor.examination import Where
+    from plr.sidecar.local.client import LocalClient
 
 EXIT_OK = 0
 EXIT_NO_ANSWER = 1

@@ -9,14 +9,14 @@ from dataclasses import dataclass, field
 from ipaddress import ip_address, ip_network
 from typing import TYPE_CHECKING, Any
 
-from sidecar.core.path.pmtu import HEADERS_V4, HEADERS_V6, LEAST_MTU
-from sidecar.core.wire.frame import BASE_BYTES
-from sidecar.doctor.finding import duration, fail, milliseconds, ok, share, warn
+from plr.sidecar.core.path.pmtu import HEADERS_V4, HEADERS_V6, LEAST_MTU
+from plr.sidecar.core.wire.frame import BASE_BYTES
+from plr.sidecar.doctor.finding import duration, fail, milliseconds, ok, share, warn
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping, Sequence
 
-    from sidecar.doctor.finding import Finding
+    from plr.sidecar.doctor.finding import Finding
 
 State = dict[str, Any]
 

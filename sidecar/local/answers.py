@@ -12,8 +12,8 @@ from typing import Annotated, Any
 
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 
-from protos.base.errors import DecodeError
-from protos.program.config_file import key_path
+from plr.protos.base.errors import DecodeError
+from plr.protos.program.config_file import key_path
 
 Text = Annotated[str, Field(max_length=4096)]
 Whole = Annotated[int, Field(ge=-(1 << 63), le=(1 << 63) - 1)]

@@ -14,17 +14,17 @@ import struct
 import time
 from typing import TYPE_CHECKING, Any
 
-from protos.base.errors import DecodeError
-from protos.base.printable import escaped
-from sidecar.local.answers import decode_line
-from sidecar.local.entrance import MAX_SOCKET_BYTES, for_group
-from sidecar.local.peer import user_of
+from plr.protos.base.errors import DecodeError
+from plr.protos.base.printable import escaped
+from plr.sidecar.local.answers import decode_line
+from plr.sidecar.local.entrance import MAX_SOCKET_BYTES, for_group
+from plr.sidecar.local.peer import user_of
 
 if TYPE_CHECKING:
     from pathlib import Path
     from types import TracebackType
 
-    from sidecar.local.answers import Line
+    from plr.sidecar.local.answers import Line
 
 CONNECT_S = 3.0
 STATE_S = 10.0

@@ -15,11 +15,11 @@ import stat
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from protos.program.own_folder import refuse_strange
-from sidecar.local.shares import Rate
+from plr.protos.program.own_folder import refuse_strange
+from plr.sidecar.local.shares import Rate
 
 if TYPE_CHECKING:
-    from protos.base.token_bucket import TokenBucket
+    from plr.protos.base.token_bucket import TokenBucket
 
 GROUP_SUFFIX = ".group"
 LOCK_SUFFIX = ".lock"

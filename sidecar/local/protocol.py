@@ -16,9 +16,9 @@ import json
 from dataclasses import dataclass
 from typing import Any
 
-from protos.base.errors import DecodeError
-from protos.model.names import node_name
-from sidecar.core.wire.frame import MAX_DATAGRAM_BYTES
+from plr.protos.base.errors import DecodeError
+from plr.protos.model.names import node_name
+from plr.sidecar.core.wire.frame import MAX_DATAGRAM_BYTES
 
 VERSION = 1
 """Version in the part `node`. A client has to ignore parts and keys that it does not know."""

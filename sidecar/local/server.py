@@ -21,11 +21,11 @@ from collections import Counter, deque
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Protocol
 
-from protos.base.errors import DecodeError
-from sidecar.core.link.pinging import Pong
-from sidecar.local.entrance import Entrance, SocketLock, for_group
-from sidecar.local.peer import groups_of, user_of
-from sidecar.local.protocol import (
+from plr.protos.base.errors import DecodeError
+from plr.sidecar.core.link.pinging import Pong
+from plr.sidecar.local.entrance import Entrance, SocketLock, for_group
+from plr.sidecar.local.peer import groups_of, user_of
+from plr.sidecar.local.protocol import (
     MAX_REQUEST_BYTES,
     MAX_REQUESTS,
     PingRequest,
@@ -35,14 +35,14 @@ from sidecar.local.protocol import (
     encode_error,
     encode_part,
 )
-from sidecar.local.shares import Rate, Rates, Shares
+from plr.sidecar.local.shares import Rate, Rates, Shares
 
 if TYPE_CHECKING:
     import socket
     from collections.abc import Iterator
     from pathlib import Path
 
-    from sidecar.core.base.values import PathId
+    from plr.sidecar.core.base.values import PathId
 
 log = logging.getLogger(__name__)
 

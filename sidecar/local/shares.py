@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from protos.base.token_bucket import TokenBucket
+from plr.protos.base.token_bucket import TokenBucket
 
 MAX_USERS = 64
 """Users remembered, those that have used up something; all of them together have few tokens to use up."""

@@ -14,22 +14,22 @@ from dataclasses import dataclass
 from itertools import islice
 from typing import TYPE_CHECKING, Any
 
-from protos.program.certificate_term import term_problem
-from sidecar.core.base.values import PathState
-from sidecar.local.protocol import VERSION
+from plr.protos.program.certificate_term import term_problem
+from plr.sidecar.core.base.values import PathState
+from plr.sidecar.local.protocol import VERSION
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Mapping
 
-    from protos.model.ids import InterfaceName
-    from protos.program.tls_files import TlsWatch
-    from protos.trust.clock_floor import ClockFloor
-    from sidecar.config.sidecar import SidecarConfig
-    from sidecar.control.client import ControlView
-    from sidecar.core.base.values import PathId
-    from sidecar.net.dataplane import ThreadedDataPlane
-    from sidecar.net.interface_manager import InterfaceView
-    from sidecar.ros.stats import BridgeStats
+    from plr.protos.model.ids import InterfaceName
+    from plr.protos.program.tls_files import TlsWatch
+    from plr.protos.trust.clock_floor import ClockFloor
+    from plr.sidecar.config.sidecar import SidecarConfig
+    from plr.sidecar.control.client import ControlView
+    from plr.sidecar.core.base.values import PathId
+    from plr.sidecar.net.dataplane import ThreadedDataPlane
+    from plr.sidecar.net.interface_manager import InterfaceView
+    from plr.sidecar.ros.stats import BridgeStats
 
 PATHS_A_PART = 16
 SERVICES_A_PART = 16

@@ -13,14 +13,14 @@ import struct
 import sys
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from sidecar.core.link.sender import Batch
-from sidecar.net.sockets import normalise, to_sockaddr
+from plr.sidecar.core.link.sender import Batch
+from plr.sidecar.net.sockets import normalise, to_sockaddr
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from protos.model.ids import Address
-    from sidecar.core.seam.stats import LinkStats
+    from plr.protos.model.ids import Address
+    from plr.sidecar.core.seam.stats import LinkStats
 
     _SockAddr = tuple[str, int] | tuple[str, int, int, int]
 

@@ -6,12 +6,12 @@ import asyncio
 import os
 from typing import TYPE_CHECKING
 
-from sidecar.net.control_sockets import open_stream
+from plr.sidecar.net.control_sockets import open_stream
 
 if TYPE_CHECKING:
     import socket
 
-    from sidecar.core.control.ways import ControlWays, Way
+    from plr.sidecar.core.control.ways import ControlWays, Way
 
 STALE_ATTEMPT_S = 1.0
 """Age at which an attempt starts again when the network changes: the kernel repeats its first packet ever more

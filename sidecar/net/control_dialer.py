@@ -4,8 +4,8 @@
       ╚═══════════════════════════ TLS, end to end ════════════════════════╝
 
 Every stream has a line: gRPC's one connection, and the TCP connection behind it, which wins a race over interfaces and
-addresses (`sidecar.core.control.race`) and is watched (`sidecar.core.control.watch`). Bytes are passed on unchanged.
-The cores make all decisions.
+addresses (`plr.sidecar.core.control.race`) and is watched (`plr.sidecar.core.control.watch`). Bytes are passed on
+unchanged. The cores make all decisions.
 """
 
 from __future__ import annotations
@@ -18,21 +18,21 @@ import time
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from protos.base.host_port import numeric_host
-from sidecar.core.control.race import ControlRace
-from sidecar.core.control.watch import CHEAPER, GONE, SILENT, ControlWatch, Leave
-from sidecar.core.control.ways import STRANGER, ControlWays, Life, WayClass
-from sidecar.net.control_attempts import Attempts, words
-from sidecar.net.control_sockets import NotAllowedError, is_ours, listen_privately, look, own_address
-from sidecar.net.host_names import HostNames
+from plr.protos.base.host_port import numeric_host
+from plr.sidecar.core.control.race import ControlRace
+from plr.sidecar.core.control.watch import CHEAPER, GONE, SILENT, ControlWatch, Leave
+from plr.sidecar.core.control.ways import STRANGER, ControlWays, Life, WayClass
+from plr.sidecar.net.control_attempts import Attempts, words
+from plr.sidecar.net.control_sockets import NotAllowedError, is_ours, listen_privately, look, own_address
+from plr.sidecar.net.host_names import HostNames
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable, Mapping, Sequence
 
-    from protos.model.ids import Address, InterfaceName
-    from sidecar.core.base.values import PathState
-    from sidecar.core.control.session import ControlStats
-    from sidecar.core.control.ways import ControlInterface, Way
+    from plr.protos.model.ids import Address, InterfaceName
+    from plr.sidecar.core.base.values import PathState
+    from plr.sidecar.core.control.session import ControlStats
+    from plr.sidecar.core.control.ways import ControlInterface, Way
 
 log = logging.getLogger(__name__)
 

@@ -8,11 +8,11 @@ import socket
 import struct
 from typing import TYPE_CHECKING
 
-from sidecar.core.control.watch import KEEPALIVE_S, Seen
+from plr.sidecar.core.control.watch import KEEPALIVE_S, Seen
 
 if TYPE_CHECKING:
-    from protos.model.ids import Address
-    from sidecar.core.control.ways import Way
+    from plr.protos.model.ids import Address
+    from plr.sidecar.core.control.ways import Way
 
 USER_TIMEOUT_MS = 5_000
 """Time without acknowledgement after which TCP gives up (TCP_USER_TIMEOUT); the same as on gRPC's own sockets."""

@@ -15,34 +15,34 @@ from dataclasses import dataclass
 from itertools import islice
 from typing import TYPE_CHECKING
 
-from protos.base.errors import DecodeError
-from sidecar.core.base.values import PathState
-from sidecar.core.engine.engine import Engine, EngineConfig
-from sidecar.core.link.pinging import Pong
-from sidecar.core.seam.links import CheckPaths, Ping, ResetPaths, SendClose, SetCredential
-from sidecar.net.decoder import Decoder
-from sidecar.net.timerfd import Timer
-from sidecar.net.watchdog import LOOK_EVERY_S, Watchdog
+from plr.protos.base.errors import DecodeError
+from plr.sidecar.core.base.values import PathState
+from plr.sidecar.core.engine.engine import Engine, EngineConfig
+from plr.sidecar.core.link.pinging import Pong
+from plr.sidecar.core.seam.links import CheckPaths, Ping, ResetPaths, SendClose, SetCredential
+from plr.sidecar.net.decoder import Decoder
+from plr.sidecar.net.timerfd import Timer
+from plr.sidecar.net.watchdog import LOOK_EVERY_S, Watchdog
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Mapping
 
-    from protos.model.ids import InterfaceName, NodeName, ServiceName, SessionId
-    from protos.model.mapping import MappingSet, ServiceMapping
-    from protos.model.members import Peer, PeerSet, ServiceOffer, ServiceUse
-    from protos.model.report import Report
-    from protos.trust.credential import SessionCredential
-    from sidecar.core.base.report_scope import ReportScope
-    from sidecar.core.base.values import ExecutionId, PathId, RejectReason, RequestId
-    from sidecar.core.crypto.session import OwnSession
-    from sidecar.core.message.decoding import Decoding
-    from sidecar.core.path.history import Change
-    from sidecar.core.path.view import PathView
-    from sidecar.core.seam.links import LinkEvent
-    from sidecar.core.seam.stats import EngineStats, LinkStats
-    from sidecar.core.stun.events import StunEvent
-    from sidecar.net.interface_thread import InterfaceThread
-    from sidecar.ports import Application
+    from plr.protos.model.ids import InterfaceName, NodeName, ServiceName, SessionId
+    from plr.protos.model.mapping import MappingSet, ServiceMapping
+    from plr.protos.model.members import Peer, PeerSet, ServiceOffer, ServiceUse
+    from plr.protos.model.report import Report
+    from plr.protos.trust.credential import SessionCredential
+    from plr.sidecar.core.base.report_scope import ReportScope
+    from plr.sidecar.core.base.values import ExecutionId, PathId, RejectReason, RequestId
+    from plr.sidecar.core.crypto.session import OwnSession
+    from plr.sidecar.core.message.decoding import Decoding
+    from plr.sidecar.core.path.history import Change
+    from plr.sidecar.core.path.view import PathView
+    from plr.sidecar.core.seam.links import LinkEvent
+    from plr.sidecar.core.seam.stats import EngineStats, LinkStats
+    from plr.sidecar.core.stun.events import StunEvent
+    from plr.sidecar.net.interface_thread import InterfaceThread
+    from plr.sidecar.ports import Application
 
 log = logging.getLogger(__name__)
 
@@ -78,7 +78,7 @@ class DataPlaneHooks:
 
 
 class ThreadedDataPlane:
-    """Implements `sidecar.ports.DataPlane` and `LinkOwner`; every method may be called from any thread."""
+    """Implements `plr.sidecar.ports.DataPlane` and `LinkOwner`; every method may be called from any thread."""
 
     def __init__(self, config: EngineConfig, own: OwnSession, hooks: DataPlaneHooks) -> None:
         self._own = own
@@ -144,7 +144,7 @@ class ThreadedDataPlane:
         self._timer_thread.join(STOP_S)
         self._decoder.stop(STOP_S)
 
-    # -- sidecar.ports.DataPlane ----------------------------------------------------------------------------------
+    # -- plr.sidecar.ports.DataPlane ----------------------------------------------------------------------------------
 
     @property
     def session(self) -> SessionId:

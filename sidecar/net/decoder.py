@@ -12,7 +12,7 @@ import time
 from typing import TYPE_CHECKING, Protocol
 
 if TYPE_CHECKING:
-    from sidecar.core.message.decoding import Decoding
+    from plr.sidecar.core.message.decoding import Decoding
 
 log = logging.getLogger(__name__)
 

@@ -11,14 +11,14 @@ import threading
 import time
 from typing import TYPE_CHECKING
 
-from protos.base.host_port import numeric_host, split_host_port
-from protos.base.token_bucket import TokenBucket
-from sidecar.net.sockets import normalise
+from plr.protos.base.host_port import numeric_host, split_host_port
+from plr.protos.base.token_bucket import TokenBucket
+from plr.sidecar.net.sockets import normalise
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from protos.model.ids import Address
+    from plr.protos.model.ids import Address
 
 log = logging.getLogger(__name__)
 

@@ -11,30 +11,30 @@ import time
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from protos.model.ids import InterfaceId, InterfaceName
-from sidecar.core.interfaces.readiness import Readiness
-from sidecar.core.interfaces.scan_schedule import WITHOUT_NEWS_S, ScanSchedule
-from sidecar.core.link.sender import LinkIdentity
-from sidecar.core.path.key_exchange import KeyLimits
-from sidecar.core.stun.events import Failed, Mapped, MappingChanged
-from sidecar.net.host_names import HostNames
-from sidecar.net.interfaces import choose, list_interfaces, missing_interfaces
-from sidecar.net.managed_interface import STOP_TIMEOUT_S, ManagedInterface
-from sidecar.net.netlink_watch import NetlinkWatch
+from plr.protos.model.ids import InterfaceId, InterfaceName
+from plr.sidecar.core.interfaces.readiness import Readiness
+from plr.sidecar.core.interfaces.scan_schedule import WITHOUT_NEWS_S, ScanSchedule
+from plr.sidecar.core.link.sender import LinkIdentity
+from plr.sidecar.core.path.key_exchange import KeyLimits
+from plr.sidecar.core.stun.events import Failed, Mapped, MappingChanged
+from plr.sidecar.net.host_names import HostNames
+from plr.sidecar.net.interfaces import choose, list_interfaces, missing_interfaces
+from plr.sidecar.net.managed_interface import STOP_TIMEOUT_S, ManagedInterface
+from plr.sidecar.net.netlink_watch import NetlinkWatch
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from protos.model.ids import Address
-    from protos.model.members import Candidate
-    from sidecar.config.sidecar import SidecarConfig
-    from sidecar.core.crypto.session import OwnSession
-    from sidecar.core.link.memory import LinkMemory
-    from sidecar.core.stun.client import StunView
-    from sidecar.core.stun.events import StunEvent
-    from sidecar.net.dataplane import ThreadedDataPlane
-    from sidecar.net.interface_thread import InterfaceThread
-    from sidecar.net.interfaces import Interface, InterfaceChoice
+    from plr.protos.model.ids import Address
+    from plr.protos.model.members import Candidate
+    from plr.sidecar.config.sidecar import SidecarConfig
+    from plr.sidecar.core.crypto.session import OwnSession
+    from plr.sidecar.core.link.memory import LinkMemory
+    from plr.sidecar.core.stun.client import StunView
+    from plr.sidecar.core.stun.events import StunEvent
+    from plr.sidecar.net.dataplane import ThreadedDataPlane
+    from plr.sidecar.net.interface_thread import InterfaceThread
+    from plr.sidecar.net.interfaces import Interface, InterfaceChoice
 
 log = logging.getLogger(__name__)
 

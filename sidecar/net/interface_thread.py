@@ -11,27 +11,27 @@ import time
 from collections import deque
 from typing import TYPE_CHECKING, Protocol
 
-from sidecar.core.base.values import PathState
-from sidecar.core.link.sender import Batch
-from sidecar.core.path.history import PathHistory
-from sidecar.core.seam.links import PathChanged, Rebind
-from sidecar.core.wire.frame import FIRST_BYTE, MAX_DATAGRAM_BYTES
-from sidecar.net.batch_socket import RECEIVE_CALLS, BatchSocket
-from sidecar.net.path_log import PathLog
-from sidecar.net.sources import Sources
-from sidecar.net.thread_state import is_in_a_call
-from sidecar.net.waiter import Waiter
+from plr.sidecar.core.base.values import PathState
+from plr.sidecar.core.link.sender import Batch
+from plr.sidecar.core.path.history import PathHistory
+from plr.sidecar.core.seam.links import PathChanged, Rebind
+from plr.sidecar.core.wire.frame import FIRST_BYTE, MAX_DATAGRAM_BYTES
+from plr.sidecar.net.batch_socket import RECEIVE_CALLS, BatchSocket
+from plr.sidecar.net.path_log import PathLog
+from plr.sidecar.net.sources import Sources
+from plr.sidecar.net.thread_state import is_in_a_call
+from plr.sidecar.net.waiter import Waiter
 
 if TYPE_CHECKING:
     import socket
     from collections.abc import Callable
 
-    from protos.model.ids import Address, InterfaceName
-    from sidecar.core.link.link import Link
-    from sidecar.core.link.pinging import Pong
-    from sidecar.core.seam.links import LinkCommand, LinkEvent
-    from sidecar.core.stun.client import StunClient
-    from sidecar.core.stun.events import StunEvent
+    from plr.protos.model.ids import Address, InterfaceName
+    from plr.sidecar.core.link.link import Link
+    from plr.sidecar.core.link.pinging import Pong
+    from plr.sidecar.core.seam.links import LinkCommand, LinkEvent
+    from plr.sidecar.core.stun.client import StunClient
+    from plr.sidecar.core.stun.events import StunEvent
 
 log = logging.getLogger(__name__)
 

@@ -14,9 +14,9 @@ from typing import TYPE_CHECKING, Any
 
 from pyroute2 import IPRoute, NetlinkError
 
-from protos.model.ids import InterfaceName
-from sidecar.config.fields import is_glob
-from sidecar.core.seam.links import Rebind
+from plr.protos.model.ids import InterfaceName
+from plr.sidecar.config.fields import is_glob
+from plr.sidecar.core.seam.links import Rebind
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence

@@ -11,25 +11,25 @@ import random
 import time
 from typing import TYPE_CHECKING
 
-from protos.model.members import Candidate, CandidateKind
-from sidecar.core.control.ways import families_in_turn
-from sidecar.core.link.link import Link
-from sidecar.core.path.pmtu import LEAST_MTU
-from sidecar.core.seam.links import SetCarrier, SetMtu, SetReady
-from sidecar.core.stun.client import StunClient
-from sidecar.net.interface_thread import InterfaceThread
-from sidecar.net.sockets import BoundTo, open_socket
+from plr.protos.model.members import Candidate, CandidateKind
+from plr.sidecar.core.control.ways import families_in_turn
+from plr.sidecar.core.link.link import Link
+from plr.sidecar.core.path.pmtu import LEAST_MTU
+from plr.sidecar.core.seam.links import SetCarrier, SetMtu, SetReady
+from plr.sidecar.core.stun.client import StunClient
+from plr.sidecar.net.interface_thread import InterfaceThread
+from plr.sidecar.net.sockets import BoundTo, open_socket
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
-    from protos.model.ids import Address, InterfaceName
-    from sidecar.core.link.memory import LinkMemory
-    from sidecar.core.link.sender import LinkIdentity
-    from sidecar.core.path.key_exchange import KeyLimits
-    from sidecar.core.seam.links import Rebind
-    from sidecar.net.interface_thread import LinkOwner
-    from sidecar.net.interfaces import Interface
+    from plr.protos.model.ids import Address, InterfaceName
+    from plr.sidecar.core.link.memory import LinkMemory
+    from plr.sidecar.core.link.sender import LinkIdentity
+    from plr.sidecar.core.path.key_exchange import KeyLimits
+    from plr.sidecar.core.seam.links import Rebind
+    from plr.sidecar.net.interface_thread import LinkOwner
+    from plr.sidecar.net.interfaces import Interface
 
 STOP_TIMEOUT_S = 1.0
 

@@ -5,11 +5,11 @@ from __future__ import annotations
 import logging
 from typing import TYPE_CHECKING
 
-from sidecar.core.base.values import PathState
+from plr.sidecar.core.base.values import PathState
 
 if TYPE_CHECKING:
-    from sidecar.core.base.values import PathId
-    from sidecar.core.seam.links import PathChanged
+    from plr.sidecar.core.base.values import PathId
+    from plr.sidecar.core.seam.links import PathChanged
 
 log = logging.getLogger(__name__)
 

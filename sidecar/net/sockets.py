@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from protos.model.ids import Address
-    from sidecar.net.interfaces import Interface
+    from plr.protos.model.ids import Address
+    from plr.sidecar.net.interfaces import Interface
 
 log = logging.getLogger(__name__)
 

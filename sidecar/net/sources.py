@@ -6,7 +6,7 @@ import socket
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from protos.model.ids import Address
+    from plr.protos.model.ids import Address
 
 _DEVICE_NAME_BYTES = 16
 """IFNAMSIZ of linux/if.h."""

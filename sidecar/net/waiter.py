@@ -7,7 +7,7 @@ import select
 import weakref
 from typing import TYPE_CHECKING
 
-from sidecar.net.timerfd import NEVER, Timer
+from plr.sidecar.net.timerfd import NEVER, Timer
 
 if TYPE_CHECKING:
     from collections.abc import Callable

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, NamedTuple
 if TYPE_CHECKING:
     from collections.abc import Collection
 
-    from sidecar.net.interface_thread import InterfaceThread
+    from plr.sidecar.net.interface_thread import InterfaceThread
 
 HUNG_AFTER_S = 0.25
 """Duration of a turn that counts as hung: a turn takes some milliseconds, and a path is doubted after 60 ms of silence

@@ -8,12 +8,12 @@ from typing import TYPE_CHECKING, TypeVar
 
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily
 
-from protos.base.histogram import MIDS
+from plr.protos.base.histogram import MIDS
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from protos.base.histogram import Histogram
+    from plr.protos.base.histogram import Histogram
 
 DURATION_BOUNDS_S = (
     0.001, 0.002, 0.003, 0.005, 0.0075, 0.01, 0.015, 0.02, 0.03, 0.04, 0.05, 0.075, 0.1, 0.125, 0.15, 0.2, 0.25, 0.3,

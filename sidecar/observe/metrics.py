@@ -14,28 +14,28 @@ from prometheus_client import CollectorRegistry, ProcessCollector
 from prometheus_client.core import HistogramMetricFamily, InfoMetricFamily
 from prometheus_client.registry import Collector
 
-from protos.base.host_port import split_host_port
-from protos.model.stream import ResourceKind
-from protos.program.metrics_server import MetricsServer
-from protos.trust.revocation_views import revocation_gauges
-from sidecar.core.control.watch import LEAVE_CAUSES
-from sidecar.core.control.ways import DIAL_DROPS
-from sidecar.core.engine.revocation_exchange import EXCHANGES
-from sidecar.local.server import REFUSALS
-from sidecar.observe.metric_families import by_one, counter, cumulative, gauge
-from sidecar.state.store import FAILURES
+from plr.protos.base.host_port import split_host_port
+from plr.protos.model.stream import ResourceKind
+from plr.protos.program.metrics_server import MetricsServer
+from plr.protos.trust.revocation_views import revocation_gauges
+from plr.sidecar.core.control.watch import LEAVE_CAUSES
+from plr.sidecar.core.control.ways import DIAL_DROPS
+from plr.sidecar.core.engine.revocation_exchange import EXCHANGES
+from plr.sidecar.local.server import REFUSALS
+from plr.sidecar.observe.metric_families import by_one, counter, cumulative, gauge
+from plr.sidecar.state.store import FAILURES
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Mapping
 
     from prometheus_client import Metric
 
-    from protos.model.ids import InterfaceName, ServiceName
-    from protos.trust.identity import Identity
-    from sidecar.control.revocations import RevocationState
-    from sidecar.core.control.session import ControlStats
-    from sidecar.core.seam.stats import EngineStats, LinkStats
-    from sidecar.ros.stats import BridgeStats
+    from plr.protos.model.ids import InterfaceName, ServiceName
+    from plr.protos.trust.identity import Identity
+    from plr.sidecar.control.revocations import RevocationState
+    from plr.sidecar.core.control.session import ControlStats
+    from plr.sidecar.core.seam.stats import EngineStats, LinkStats
+    from plr.sidecar.ros.stats import BridgeStats
 
 _OUTCOMES = ("ok", "deadline_missed", "failed", "rejected")
 

@@ -8,8 +8,8 @@ from __future__ import annotations
 import difflib
 from typing import TYPE_CHECKING
 
-from protos.model.ids import ServiceName
-from sidecar.config.fields import is_glob
+from plr.protos.model.ids import ServiceName
+from plr.sidecar.config.fields import is_glob
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterable, Mapping

@@ -11,24 +11,24 @@ import threading
 import time
 from typing import TYPE_CHECKING, Protocol
 
-from protos.model.ids import Role
-from sidecar.core.base.values import RejectReason
-from sidecar.core.seam.application import ExecuteRequest
-from sidecar.ros.cloud.cloud_side import CloudSide
-from sidecar.ros.event_queue import EventQueue
-from sidecar.ros.graph.graph import sidecar_node_name
-from sidecar.ros.graph.looks import Looks
-from sidecar.ros.log_limit import LimitedLog
-from sidecar.ros.robot.robot_side import RobotSide
-from sidecar.ros.ros_loop import RosLoop
-from sidecar.ros.stats import BridgeStats
+from plr.protos.model.ids import Role
+from plr.sidecar.core.base.values import RejectReason
+from plr.sidecar.core.seam.application import ExecuteRequest
+from plr.sidecar.ros.cloud.cloud_side import CloudSide
+from plr.sidecar.ros.event_queue import EventQueue
+from plr.sidecar.ros.graph.graph import sidecar_node_name
+from plr.sidecar.ros.graph.looks import Looks
+from plr.sidecar.ros.log_limit import LimitedLog
+from plr.sidecar.ros.robot.robot_side import RobotSide
+from plr.sidecar.ros.ros_loop import RosLoop
+from plr.sidecar.ros.stats import BridgeStats
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from sidecar.core.rules.service_rule import ServiceRule
-    from sidecar.core.seam.application import ApplicationEvent
-    from sidecar.ports import Application, DataPlane
+    from plr.sidecar.core.rules.service_rule import ServiceRule
+    from plr.sidecar.core.seam.application import ApplicationEvent
+    from plr.sidecar.ports import Application, DataPlane
 
 DRAIN_S = 0.005
 """Time the ROS thread spends on the data plane's events before it takes the servers' answers again."""

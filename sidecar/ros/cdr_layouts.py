@@ -15,10 +15,10 @@ from rosidl_parser.definition import (
     UnboundedString,
 )
 
-from sidecar.ros import cdr_walk
+from plr.sidecar.ros import cdr_walk
 
 if TYPE_CHECKING:
-    from sidecar.ros.cdr_walk import Layout
+    from plr.sidecar.ros.cdr_walk import Layout
 
 _BYTES = {
     **dict.fromkeys(("boolean", "octet", "char", "int8", "uint8"), 1),

@@ -12,11 +12,11 @@ from __future__ import annotations
 from collections import OrderedDict, deque
 from typing import TYPE_CHECKING
 
-from sidecar.core.seam.application import AbandonExecution, CallsForbidden, CancelExecution, ExecuteRequest
+from plr.sidecar.core.seam.application import AbandonExecution, CallsForbidden, CancelExecution, ExecuteRequest
 
 if TYPE_CHECKING:
-    from protos.model.ids import NodeName
-    from sidecar.core.seam.application import ApplicationEvent
+    from plr.protos.model.ids import NodeName
+    from plr.sidecar.core.seam.application import ApplicationEvent
 
 
 class EventQueue:

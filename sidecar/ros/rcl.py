@@ -22,9 +22,9 @@ from typing import Any
 
 from rclpy.impl.implementation_singleton import rclpy_implementation as _rclpy
 
-from sidecar.ros.cdr_layouts import layout_of
-from sidecar.ros.cdr_walk import CdrError, check
-from sidecar.ros.errors import RosBridgeError
+from plr.sidecar.ros.cdr_layouts import layout_of
+from plr.sidecar.ros.cdr_walk import CdrError, check
+from plr.sidecar.ros.errors import RosBridgeError
 
 _OK = 0
 _TIMEOUT = 2

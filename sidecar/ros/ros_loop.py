@@ -17,7 +17,7 @@ from rclpy.parameter import Parameter
 from rclpy.qos import QoSProfile, qos_profile_services_default
 from rclpy.signals import SignalHandlerOptions
 
-from sidecar.ros.rcl import graph_guard, wait_for_guard
+from plr.sidecar.ros.rcl import graph_guard, wait_for_guard
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from protos.model.ids import ServiceName
+    from plr.protos.model.ids import ServiceName
 
 
 @dataclass(slots=True)
@@ -33,7 +33,7 @@ class BridgeStats:
     abandoned: Counter[ServiceName] = field(default_factory=Counter)
     """Cloud: requests whose answer is no longer awaited."""
     fallbacks: Counter[tuple[ServiceName, str]] = field(default_factory=Counter)
-    """Robot: (service, outcome: one of `sidecar.core.robot.fallback.fallbacks.OUTCOMES`)."""
+    """Robot: (service, outcome: one of `plr.sidecar.core.robot.fallback.fallbacks.OUTCOMES`)."""
     fallback_up: dict[ServiceName, bool] = field(default_factory=dict)
     """Robot: whether the fallback of each service that has one can be called. Replaced, never changed."""
     fallback_takes_s: dict[ServiceName, float] = field(default_factory=dict)

@@ -13,8 +13,8 @@ from typing import Any
 
 from rclpy.type_support import check_for_type_support
 
-from sidecar.ros.errors import RosBridgeError
-from sidecar.ros.rcl import MessageType
+from plr.sidecar.ros.errors import RosBridgeError
+from plr.sidecar.ros.rcl import MessageType
 
 _SERVICE_TYPE = re.compile(r"([a-z][a-z0-9_]{0,254})/srv/([A-Z][A-Za-z0-9]{0,254})")
 

@@ -27,16 +27,16 @@ import struct
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
-from protos.base.errors import DecodeError
-from protos.base.host_port import canonical_ip
-from protos.convert import control_message_to_proto, parse_control_message
-from protos.model.mapping import MappingSet
-from protos.model.members import TOKEN_BYTES, PeerSet
-from protos.model.stream import Welcome
+from plr.protos.base.errors import DecodeError
+from plr.protos.base.host_port import canonical_ip
+from plr.protos.convert import control_message_to_proto, parse_control_message
+from plr.protos.model.mapping import MappingSet
+from plr.protos.model.members import TOKEN_BYTES, PeerSet
+from plr.protos.model.stream import Welcome
 
 if TYPE_CHECKING:
-    from protos.model.ids import Address, NodeName
-    from protos.model.stream import ControlMessage
+    from plr.protos.model.ids import Address, NodeName
+    from plr.protos.model.stream import ControlMessage
 
 FORMAT_VERSION = 1
 """Format version of a file; any other is refused."""

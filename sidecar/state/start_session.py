@@ -8,18 +8,18 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from protos.base.errors import ConfigError
-from protos.trust.credential import Aead, SessionCredential, session_number, verify
-from sidecar.core.crypto.session import OwnSession, public_key
-from sidecar.core.wire.introduction import MAX_INTRODUCED_BYTES
+from plr.protos.base.errors import ConfigError
+from plr.protos.trust.credential import Aead, SessionCredential, session_number, verify
+from plr.sidecar.core.crypto.session import OwnSession, public_key
+from plr.sidecar.core.wire.introduction import MAX_INTRODUCED_BYTES
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from protos.model.ids import NodeName, Role
-    from protos.program.tls_files import TlsFiles
-    from protos.trust.clock_floor import ClockFloor
-    from protos.trust.identity import Identity
+    from plr.protos.model.ids import NodeName, Role
+    from plr.protos.program.tls_files import TlsFiles
+    from plr.protos.trust.clock_floor import ClockFloor
+    from plr.protos.trust.identity import Identity
 
 PRIVATE_KEY_BYTES = 32
 CPUINFO = Path("/proc/cpuinfo")

@@ -16,11 +16,11 @@ import time
 from collections import Counter
 from typing import TYPE_CHECKING, TypeVar
 
-from protos.base.errors import DecodeError
-from protos.model.members import TOKEN_BYTES
-from protos.program.own_folder import OwnFolder
-from protos.program.regular_file import open_regular
-from sidecar.state.file import (
+from plr.protos.base.errors import DecodeError
+from plr.protos.model.members import TOKEN_BYTES
+from plr.protos.program.own_folder import OwnFolder
+from plr.protos.program.regular_file import open_regular
+from plr.sidecar.state.file import (
     MAX_FILE_BYTES,
     ControlAddresses,
     Identity,
@@ -41,8 +41,8 @@ if TYPE_CHECKING:
     from collections.abc import Callable
     from pathlib import Path
 
-    from protos.model.ids import Address, NodeName
-    from protos.model.stream import ControlMessage
+    from plr.protos.model.ids import Address, NodeName
+    from plr.protos.model.stream import ControlMessage
 
 log = logging.getLogger(__name__)
 

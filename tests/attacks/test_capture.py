@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from sidecar.core.wire.frame import HEADER_BYTES
+from plr.sidecar.core.wire.frame import HEADER_BYTES
 from tests.attacks.world import CLOUDS, World, is_ours
 from tests.support.calling import Call, assert_flawless
 

@@ -15,19 +15,19 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from controlplane.ca import Authority, Validity
-from controlplane.ca.files import write_tls_files
 from lab.attacker.control_client import CONNECT, CONTROL_PLANE_DNS
 from lab.system import CONTROL_PORT
-from protos.model.ids import Role
-from protos.trust.identity import IdentityRole
+from plr.controlplane.ca import Authority, Validity
+from plr.controlplane.ca.files import write_tls_files
+from plr.protos.model.ids import Role
+from plr.protos.trust.identity import IdentityRole
 from tests.attacks.world import ATTACKER, World
 from tests.support.registrations import registration
 
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from controlplane.ca import Issued
+    from plr.controlplane.ca import Issued
 
 pytestmark = [pytest.mark.netns, pytest.mark.ros, pytest.mark.timeout(180)]
 

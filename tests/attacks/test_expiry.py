@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from controlplane.ca.certificates import Validity
 from lab.system import read_json
-from protos.trust.identity import IdentityRole
+from plr.controlplane.ca.certificates import Validity
+from plr.protos.trust.identity import IdentityRole
 from tests.attacks.world import SERVICES
 
 if TYPE_CHECKING:

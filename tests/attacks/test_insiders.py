@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from controlplane.ca import Authority
 from lab.system import CONTROL_PORT, System, read_json
-from protos.trust.identity import IdentityRole
+from plr.controlplane.ca import Authority
+from plr.protos.trust.identity import IdentityRole
 from tests.attacks.world import ATTACKER, World, attack_lab, is_ours
 
 if TYPE_CHECKING:

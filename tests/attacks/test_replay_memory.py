@@ -10,20 +10,20 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from protos.model.ids import InterfaceId, InterfaceName, NodeName, Role, SessionId, Version
-from protos.model.members import PeerSet
-from sidecar.core.link.memory import MAX_PATHS_OF_A_PEER
-from sidecar.core.path.key_exchange import DEFAULT_LIMITS, KeyLimits
-from sidecar.core.path.keys import make_path_keys
-from sidecar.core.wire import frame
-from sidecar.core.wire.frame import Header
-from sidecar.core.wire.introduction import encode_introduction
+from plr.protos.model.ids import InterfaceId, InterfaceName, NodeName, Role, SessionId, Version
+from plr.protos.model.members import PeerSet
+from plr.sidecar.core.link.memory import MAX_PATHS_OF_A_PEER
+from plr.sidecar.core.path.key_exchange import DEFAULT_LIMITS, KeyLimits
+from plr.sidecar.core.path.keys import make_path_keys
+from plr.sidecar.core.wire import frame
+from plr.sidecar.core.wire.frame import Header
+from plr.sidecar.core.wire.introduction import encode_introduction
 from tests.support.mesh import Mesh, rule
 from tests.support.sessions import credential_of, seal, session_of
 
 if TYPE_CHECKING:
-    from protos.model.ids import Address
-    from sidecar.core.link.link import Link
+    from plr.protos.model.ids import Address
+    from plr.sidecar.core.link.link import Link
     from tests.support.mesh import Node
 
 pytestmark = pytest.mark.audit("sec-1")

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from controlplane.ca.files import write_atomically
-from protos.program.tls_files import CRL_FILE
+from plr.controlplane.ca.files import write_atomically
+from plr.protos.program.tls_files import CRL_FILE
 from tests.attacks.world import SERVICES
 
 if TYPE_CHECKING:

@@ -9,18 +9,18 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from controlplane.ca import Authority
-from controlplane.ca.files import write_atomically, write_tls_files
 from lab.system import CONTROL_METRICS_PORT, METRICS_PORT, System
-from protos.program.tls_files import CA_FILE, CRL_FILE
+from plr.controlplane.ca import Authority
+from plr.controlplane.ca.files import write_atomically, write_tls_files
+from plr.protos.program.tls_files import CA_FILE, CRL_FILE
 from tests.attacks.world import World, attack_lab, is_ours
 from tests.support.calling import Call, assert_flawless
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from controlplane.ca import Issued
     from lab.attacker.wire import Captured
+    from plr.controlplane.ca import Issued
 
 pytestmark = [pytest.mark.netns, pytest.mark.ros, pytest.mark.timeout(600)]
 

@@ -8,15 +8,15 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from protos.model.ids import Role, Version
-from protos.model.members import PeerSet
-from protos.trust.credential import session_number
-from protos.trust.identity import MALFORMED, CertificateError
+from plr.protos.model.ids import Role, Version
+from plr.protos.model.members import PeerSet
+from plr.protos.trust.credential import session_number
+from plr.protos.trust.identity import MALFORMED, CertificateError
 from tests.support.mesh import Mesh, rule
 from tests.support.sessions import session_of
 
 if TYPE_CHECKING:
-    from protos.trust.credential import SessionCredential
+    from plr.protos.trust.credential import SessionCredential
 
 CALLS = 20
 

@@ -11,15 +11,15 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from controlplane.core.stun.source_limits import ANSWERS_BURST, ANSWERS_PER_S
 from lab.attacker.wire import Captured
 from lab.system import STUN_PORT
-from protos.stun.codec import MessageClass, StunMessage, decode, encode, is_stun
+from plr.controlplane.core.stun.source_limits import ANSWERS_BURST, ANSWERS_PER_S
+from plr.protos.stun.codec import MessageClass, StunMessage, decode, encode, is_stun
 from tests.attacks.world import ATTACKER, ATTACKERS_PORT, World, is_ours, send_all
 
 if TYPE_CHECKING:
     from lab.attacker.wire import Tap
-    from protos.model.ids import Address
+    from plr.protos.model.ids import Address
 
 pytestmark = [pytest.mark.netns, pytest.mark.ros, pytest.mark.timeout(180)]
 

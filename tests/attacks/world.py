@@ -15,11 +15,11 @@ import time
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
-from controlplane.ca.files import write_atomically
 from lab import Lab, LabConfig, LinkProfile, robot, server
 from lab.attacker.wire import Tap
 from lab.system import CONTROL_METRICS_PORT, METRICS_PORT
-from protos.program.tls_files import CRL_FILE
+from plr.controlplane.ca.files import write_atomically
+from plr.protos.program.tls_files import CRL_FILE
 from tests.support.calling import Call
 
 if TYPE_CHECKING:
@@ -77,7 +77,7 @@ class World:
         self.system.start_control_plane(**({} if policy is None else {"policy": policy}))
         for cloud in CLOUDS:
             self.system.start_node(f"{cloud}.echo", cloud, ["-m", "lab.echo", "serve"])
-            module = "lab.attacker.rogue_cloud" if cloud == rogue else "sidecar"
+            module = "lab.attacker.rogue_cloud" if cloud == rogue else "plr.sidecar"
             self.system.start_cloud(cloud, OFFERS, module=module, **sidecars)
         self.system.wait_for_offer(self.start_robot(**sidecars))
 

@@ -8,8 +8,8 @@ import yaml
 from hypothesis import given
 from hypothesis import strategies as st
 
-from protos.base.errors import ConfigError
-from sidecar.config.sidecar import SidecarConfig, parse_config
+from plr.protos.base.errors import ConfigError
+from plr.sidecar.config.sidecar import SidecarConfig, parse_config
 
 _KEYS = st.sampled_from([*SidecarConfig.model_fields, "deadline_ms", "name", "servers", "address", "enabled"])
 _SCALARS = (

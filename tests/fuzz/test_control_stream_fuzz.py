@@ -17,12 +17,12 @@ import pytest
 
 from lab.attacker.control_client import CONNECT
 from lab.attacker.junk import mangled, noise
-from protos.convert import sidecar_message_to_proto
-from protos.model.ids import NodeName, Role
-from protos.model.members import CandidateSet, ServiceSet
-from protos.model.report import Report
-from protos.model.stream import Drain, Heartbeat
-from protos.trust.identity import CONTROL_PLANE_DNS, IdentityRole
+from plr.protos.convert import sidecar_message_to_proto
+from plr.protos.model.ids import NodeName, Role
+from plr.protos.model.members import CandidateSet, ServiceSet
+from plr.protos.model.report import Report
+from plr.protos.model.stream import Drain, Heartbeat
+from plr.protos.trust.identity import CONTROL_PLANE_DNS, IdentityRole
 from tests.support.control_plane_process import Secured, cloud, open_channel, robot
 from tests.support.registrations import registration
 from tests.support.samples import histogram, interfaces, latency, offer, path, use
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
     from pathlib import Path
 
-    from controlplane.ca import Issued
+    from plr.controlplane.ca import Issued
 
 MB = 1e6
 DATAGRAMS_A_MESSAGE = 100

@@ -9,8 +9,8 @@ from google.protobuf.message import DecodeError as ProtobufDecodeError
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from protos.base.errors import DecodeError
-from protos.convert import (
+from plr.protos.base.errors import DecodeError
+from plr.protos.convert import (
     control_message_to_proto,
     explanation_from_proto,
     explanation_to_proto,
@@ -20,7 +20,7 @@ from protos.convert import (
     status_from_proto,
     status_to_proto,
 )
-from protos.plr.v1 import admin_pb2
+from plr.protos.plr.v1 import admin_pb2
 from tests.unit.protos import message_strategies as some
 
 if TYPE_CHECKING:

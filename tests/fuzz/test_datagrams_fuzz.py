@@ -14,13 +14,13 @@ import psutil
 import pytest
 
 from lab.attacker.junk import flipped, headed, mangled, noise
-from protos.model.ids import InterfaceName
-from sidecar.core.wire.frame import HEADER_BYTES
+from plr.protos.model.ids import InterfaceName
+from plr.sidecar.core.wire.frame import HEADER_BYTES
 from tests.fuzz.test_engine_fuzz import ATTACKS, Rogue, arena, assert_bounded
 from tests.support.mesh import Mesh, Node
 
 if TYPE_CHECKING:
-    from protos.model.ids import Address
+    from plr.protos.model.ids import Address
 
 MB = 1e6
 SEEN = 400

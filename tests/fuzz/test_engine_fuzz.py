@@ -7,18 +7,18 @@ from typing import TYPE_CHECKING
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from protos.model.ids import Role, ServiceName
-from sidecar.core.base.values import PathState, Priority, RejectReason, RequestId
-from sidecar.core.cloud.answers import MAX_ANSWER_BYTES, MAX_ANSWERS
-from sidecar.core.cloud.answers import TIMER_SLACK as ANSWER_TIMER_SLACK
-from sidecar.core.cloud.executions import MAX_CACHED_BYTES, MAX_REMEMBERED, MAX_RUNNING, TIMER_SLACK
-from sidecar.core.cloud.refused_copies import MAX_REFUSED_COPIES
-from sidecar.core.link.path_table import MAX_PENDING_FINISHED, MAX_PENDING_FRAMES
-from sidecar.core.message.reassembly import MAX_PEER_BYTES, MAX_PEER_MESSAGES, OVER_REMEMBERED
-from sidecar.core.transfer.room import MAX_MESSAGES
-from sidecar.core.wire import frame
-from sidecar.core.wire.frame import BASE_SYMBOL_BYTES, MAX_MESSAGE_BYTES, Header, Probe, ProbeReply
-from sidecar.core.wire.messages import (
+from plr.protos.model.ids import Role, ServiceName
+from plr.sidecar.core.base.values import PathState, Priority, RejectReason, RequestId
+from plr.sidecar.core.cloud.answers import MAX_ANSWER_BYTES, MAX_ANSWERS
+from plr.sidecar.core.cloud.answers import TIMER_SLACK as ANSWER_TIMER_SLACK
+from plr.sidecar.core.cloud.executions import MAX_CACHED_BYTES, MAX_REMEMBERED, MAX_RUNNING, TIMER_SLACK
+from plr.sidecar.core.cloud.refused_copies import MAX_REFUSED_COPIES
+from plr.sidecar.core.link.path_table import MAX_PENDING_FINISHED, MAX_PENDING_FRAMES
+from plr.sidecar.core.message.reassembly import MAX_PEER_BYTES, MAX_PEER_MESSAGES, OVER_REMEMBERED
+from plr.sidecar.core.transfer.room import MAX_MESSAGES
+from plr.sidecar.core.wire import frame
+from plr.sidecar.core.wire.frame import BASE_SYMBOL_BYTES, MAX_MESSAGE_BYTES, Header, Probe, ProbeReply
+from plr.sidecar.core.wire.messages import (
     CancelMessage,
     Message,
     RejectionMessage,
@@ -33,8 +33,8 @@ if TYPE_CHECKING:
     import random
     from collections.abc import Callable, Iterable, Iterator
 
-    from protos.model.ids import InterfaceName
-    from sidecar.core.path.path import Path
+    from plr.protos.model.ids import InterfaceName
+    from plr.sidecar.core.path.path import Path
 
 
 def fragment(number: int, total: int, symbol: int, index: int) -> bytes:

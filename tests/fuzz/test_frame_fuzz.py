@@ -5,10 +5,10 @@ from __future__ import annotations
 from hypothesis import given
 from hypothesis import strategies as st
 
-from protos.base.errors import DecodeError
-from protos.model.ids import InterfaceId, SessionId
-from sidecar.core.wire import frame
-from sidecar.core.wire.frame import AckFrame, Finished, Fragment, Header, Probe, ProbeReply
+from plr.protos.base.errors import DecodeError
+from plr.protos.model.ids import InterfaceId, SessionId
+from plr.sidecar.core.wire import frame
+from plr.sidecar.core.wire.frame import AckFrame, Finished, Fragment, Header, Probe, ProbeReply
 
 u8, u16, u32, u64 = (st.integers(0, 2**bits - 1) for bits in (8, 16, 32, 64))
 headers = st.builds(

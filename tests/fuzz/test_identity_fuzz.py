@@ -8,10 +8,10 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from controlplane.ca import Authority
-from protos.model.ids import NodeName, Role, SessionId
-from protos.trust.credential import Aead, SessionCredential, verify
-from protos.trust.identity import CertificateError, IdentityRole, Trust
+from plr.controlplane.ca import Authority
+from plr.protos.model.ids import NodeName, Role, SessionId
+from plr.protos.trust.credential import Aead, SessionCredential, verify
+from plr.protos.trust.identity import CertificateError, IdentityRole, Trust
 from tests.support.forged import NOW, Recipe, uri
 
 CA = Authority.create(clock=lambda: NOW)

@@ -8,13 +8,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from protos.model.ids import InterfaceId, SessionId
-from sidecar.core.base.values import PathId
-from sidecar.core.crypto.aead import TAG_BYTES
-from sidecar.core.link.path_table import MAX_PATHS_OF_A_PEER, MAX_PENDING_FRAMES
-from sidecar.core.seam.links import FragmentsReceived, Send
-from sidecar.core.wire import frame
-from sidecar.core.wire.frame import MAX_ACK_RANGES, Header, Probe, ProbeReply
+from plr.protos.model.ids import InterfaceId, SessionId
+from plr.sidecar.core.base.values import PathId
+from plr.sidecar.core.crypto.aead import TAG_BYTES
+from plr.sidecar.core.link.path_table import MAX_PATHS_OF_A_PEER, MAX_PENDING_FRAMES
+from plr.sidecar.core.seam.links import FragmentsReceived, Send
+from plr.sidecar.core.wire import frame
+from plr.sidecar.core.wire.frame import MAX_ACK_RANGES, Header, Probe, ProbeReply
 from tests.support.builders import OUR_TOKEN, PEER_ADDRESS, PEER_SESSION, PEER_TOKEN, WLAN, A, Bench, message
 
 numbers = st.integers(0, 60) | st.integers(0, 2**64 - 1)

@@ -6,11 +6,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from protos.base.errors import DecodeError
-from protos.model.ids import ServiceName
-from protos.model.names import clean_text
-from sidecar.core.base.values import Priority, RejectReason, RequestId
-from sidecar.core.wire.messages import (
+from plr.protos.base.errors import DecodeError
+from plr.protos.model.ids import ServiceName
+from plr.protos.model.names import clean_text
+from plr.sidecar.core.base.values import Priority, RejectReason, RequestId
+from plr.sidecar.core.wire.messages import (
     MAX_NAME_BYTES,
     CancelMessage,
     Message,

@@ -3,7 +3,7 @@ from __future__ import annotations
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sidecar.net.netlink_watch import read_announcements
+from plr.sidecar.net.netlink_watch import read_announcements
 
 
 @given(st.binary(max_size=200))

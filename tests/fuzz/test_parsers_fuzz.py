@@ -17,8 +17,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from lab.attacker.junk import flipped, mangled, noise
-from protos.base.errors import DecodeError
-from protos.convert import (
+from plr.protos.base.errors import DecodeError
+from plr.protos.convert import (
     control_message_to_proto,
     explanation_from_proto,
     explanation_to_proto,
@@ -28,10 +28,10 @@ from protos.convert import (
     status_from_proto,
     status_to_proto,
 )
-from protos.model.ids import NodeName
-from protos.plr.v1 import admin_pb2
-from sidecar.state import file
-from sidecar.state.file import LastGood
+from plr.protos.model.ids import NodeName
+from plr.protos.plr.v1 import admin_pb2
+from plr.sidecar.state import file
+from plr.sidecar.state.file import LastGood
 from tests.fuzz.test_state_file_fuzz import sealed
 from tests.unit.protos import message_strategies as some
 

@@ -6,9 +6,9 @@ from __future__ import annotations
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sidecar.ros.errors import RosBridgeError
-from sidecar.ros.graph.participant_info import nodes_of
-from sidecar.ros.graph.unknown_nodes import UnknownNodes
+from plr.sidecar.ros.errors import RosBridgeError
+from plr.sidecar.ros.graph.participant_info import nodes_of
+from plr.sidecar.ros.graph.unknown_nodes import UnknownNodes
 from tests.support.participant_messages import endpoint, participant_info
 
 WRITERS = [endpoint(7, number) for number in range(6)]

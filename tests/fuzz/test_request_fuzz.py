@@ -10,10 +10,10 @@ from cryptography.hazmat.primitives.serialization import Encoding
 from hypothesis import given
 from hypothesis import strategies as st
 
-from controlplane.ca.certificates import generate_key
-from controlplane.ca.request import build_request, parse_request
-from protos.base.errors import DecodeError
-from protos.trust.identity import IdentityRole
+from plr.controlplane.ca.certificates import generate_key
+from plr.controlplane.ca.request import build_request, parse_request
+from plr.protos.base.errors import DecodeError
+from plr.protos.trust.identity import IdentityRole
 
 pytestmark = pytest.mark.audit("sec-11")
 

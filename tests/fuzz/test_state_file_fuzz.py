@@ -10,12 +10,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from protos.base.errors import DecodeError
-from protos.model.ids import NodeName, Version
-from protos.model.mapping import MappingSet
-from protos.model.members import PeerSet
-from protos.model.stream import Welcome
-from sidecar.state.file import (
+from plr.protos.base.errors import DecodeError
+from plr.protos.model.ids import NodeName, Version
+from plr.protos.model.mapping import MappingSet
+from plr.protos.model.members import PeerSet
+from plr.protos.model.stream import Welcome
+from plr.sidecar.state.file import (
     FORMAT_VERSION,
     LAST_GOOD_VERSION,
     LastGood,

@@ -9,9 +9,9 @@ from ipaddress import IPv4Address, IPv6Address
 from hypothesis import given
 from hypothesis import strategies as st
 
-from controlplane.core.stun.responder import StunOutcome, StunResponder
-from protos.base.errors import DecodeError
-from protos.stun.codec import (
+from plr.controlplane.core.stun.responder import StunOutcome, StunResponder
+from plr.protos.base.errors import DecodeError
+from plr.protos.stun.codec import (
     HEADER_BYTES,
     MAX_TEXT_CHARACTERS,
     Attribute,
@@ -21,7 +21,7 @@ from protos.stun.codec import (
     encode,
     is_stun,
 )
-from sidecar.core.stun.client import StunClient
+from plr.sidecar.core.stun.client import StunClient
 
 COOKIE = bytes.fromhex("2112a442")
 

@@ -11,11 +11,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from controlplane.ca import Authority
-from controlplane.ca.index import decode_index, encode_index
-from protos.base.errors import ConfigError
-from protos.program.tls_files import load_tls_files
-from protos.trust.identity import IdentityRole
+from plr.controlplane.ca import Authority
+from plr.controlplane.ca.index import decode_index, encode_index
+from plr.protos.base.errors import ConfigError
+from plr.protos.program.tls_files import load_tls_files
+from plr.protos.trust.identity import IdentityRole
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

@@ -19,18 +19,18 @@ from typing import TYPE_CHECKING, Any, Self
 
 from bench.dataplane.programs.engine import TYPE, described, peer_of
 from bench.dataplane.remote import Remote
-from protos.model.ids import InterfaceId, InterfaceName, NodeName, Role, ServiceName, SessionId, Version
-from protos.model.mapping import Assignment, MappingSet, ServiceMapping
-from protos.model.members import Candidate, CandidateKind, PeerSet, ServiceOffer
-from sidecar.core.base.values import RequestId
-from sidecar.core.engine.engine import EngineConfig
-from sidecar.core.link.link import Link
-from sidecar.core.link.sender import LinkIdentity
-from sidecar.core.rules.service_rule import ServiceRule
-from sidecar.core.seam.application import ApplicationEvent, OfferService, RequestFailed, ResponseArrived
-from sidecar.core.seam.links import SetReady
-from sidecar.net.dataplane import DataPlaneHooks, ThreadedDataPlane
-from sidecar.net.interface_thread import InterfaceThread
+from plr.protos.model.ids import InterfaceId, InterfaceName, NodeName, Role, ServiceName, SessionId, Version
+from plr.protos.model.mapping import Assignment, MappingSet, ServiceMapping
+from plr.protos.model.members import Candidate, CandidateKind, PeerSet, ServiceOffer
+from plr.sidecar.core.base.values import RequestId
+from plr.sidecar.core.engine.engine import EngineConfig
+from plr.sidecar.core.link.link import Link
+from plr.sidecar.core.link.sender import LinkIdentity
+from plr.sidecar.core.rules.service_rule import ServiceRule
+from plr.sidecar.core.seam.application import ApplicationEvent, OfferService, RequestFailed, ResponseArrived
+from plr.sidecar.core.seam.links import SetReady
+from plr.sidecar.net.dataplane import DataPlaneHooks, ThreadedDataPlane
+from plr.sidecar.net.interface_thread import InterfaceThread
 from tests.support.sessions import session_of
 
 if TYPE_CHECKING:

@@ -9,15 +9,15 @@ from typing import TYPE_CHECKING, TypeVar
 
 import grpc
 
-from protos.convert import control_message_to_proto, sidecar_message_from_proto
-from protos.model.members import Registration
-from protos.plr.v1 import control_pb2, control_pb2_grpc
+from plr.protos.convert import control_message_to_proto, sidecar_message_from_proto
+from plr.protos.model.members import Registration
+from plr.protos.plr.v1 import control_pb2, control_pb2_grpc
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
     from typing import Self
 
-    from protos.model.stream import ControlMessage, SidecarMessage, Welcome
+    from plr.protos.model.stream import ControlMessage, SidecarMessage, Welcome
 
 WAIT_S = 20.0
 """Far more than anything takes here: a busy machine must not fail a test."""

@@ -8,27 +8,27 @@ from typing import TYPE_CHECKING, Any
 import grpc
 import pytest
 
-from controlplane import turns
-from controlplane.cli.__main__ import main
-from controlplane.config.controlplane import ControlPlaneConfig
-from controlplane.core.registry.registry import Refusal
-from controlplane.loop import ControlLoop
-from controlplane.observe.event_log import EventLog
-from controlplane.observe.metrics import Metrics
-from controlplane.serve import admin
-from controlplane.serve.admin import AdminService
-from protos.convert import status_from_proto
-from protos.model.fleet_events import EventKind
-from protos.model.ids import InterfaceName, NodeName, Role
-from protos.model.members import CandidateSet, ServiceSet
-from protos.model.report import PathReport, Report
-from protos.plr.v1 import admin_pb2, admin_pb2_grpc
+from plr.controlplane import turns
+from plr.controlplane.cli.__main__ import main
+from plr.controlplane.config.controlplane import ControlPlaneConfig
+from plr.controlplane.core.registry.registry import Refusal
+from plr.controlplane.loop import ControlLoop
+from plr.controlplane.observe.event_log import EventLog
+from plr.controlplane.observe.metrics import Metrics
+from plr.controlplane.serve import admin
+from plr.controlplane.serve.admin import AdminService
+from plr.protos.convert import status_from_proto
+from plr.protos.model.fleet_events import EventKind
+from plr.protos.model.ids import InterfaceName, NodeName, Role
+from plr.protos.model.members import CandidateSet, ServiceSet
+from plr.protos.model.report import PathReport, Report
+from plr.protos.plr.v1 import admin_pb2, admin_pb2_grpc
 from tests.support.samples import histogram, interfaces, offer, registration, use
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable
 
-    from protos.model.stream import SidecarMessage
+    from plr.protos.model.stream import SidecarMessage
 
     Ask = Callable[[admin_pb2_grpc.AdminAsyncStub, ControlLoop], Awaitable[None]]
 

@@ -8,23 +8,23 @@ import signal
 import time
 from typing import TYPE_CHECKING
 
-from protos.model.ids import Role
-from protos.model.members import CandidateSet, PeerSet, ServiceSet
-from protos.model.report import Report
-from protos.model.status import SyncState
-from sidecar.control.client import ControlClient
-from sidecar.core.control.session import ControlSession
-from sidecar.net.control_dialer import ControlDialer
+from plr.protos.model.ids import Role
+from plr.protos.model.members import CandidateSet, PeerSet, ServiceSet
+from plr.protos.model.report import Report
+from plr.protos.model.status import SyncState
+from plr.sidecar.control.client import ControlClient
+from plr.sidecar.core.control.session import ControlSession
+from plr.sidecar.net.control_dialer import ControlDialer
 from tests.support.control_plane_process import PATIENCE_S, ControlPlaneProcess, cloud
 from tests.support.samples import interfaces, path, registration, use
 
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from protos.model.mapping import MappingSet
-    from protos.model.stream import Welcome
-    from protos.program.tls_files import TlsFiles
-    from sidecar.core.base.report_scope import ReportScope
+    from plr.protos.model.mapping import MappingSet
+    from plr.protos.model.stream import Welcome
+    from plr.protos.program.tls_files import TlsFiles
+    from plr.sidecar.core.base.report_scope import ReportScope
 
 
 class Engine:

@@ -9,23 +9,23 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from controlplane import turns
-from controlplane.config.controlplane import ControlPlaneConfig
-from controlplane.loop import ControlLoop
-from controlplane.observe import metrics as metrics_module
-from controlplane.observe.event_log import EventLog
-from controlplane.observe.metrics import Metrics
-from controlplane.serve import certificate_watch
-from controlplane.serve.certificate_watch import CertificateKeeper
-from protos.program.tls_files import load_tls_files
-from protos.trust.clock_floor import ClockFloor
+from plr.controlplane import turns
+from plr.controlplane.config.controlplane import ControlPlaneConfig
+from plr.controlplane.loop import ControlLoop
+from plr.controlplane.observe import metrics as metrics_module
+from plr.controlplane.observe.event_log import EventLog
+from plr.controlplane.observe.metrics import Metrics
+from plr.controlplane.serve import certificate_watch
+from plr.controlplane.serve.certificate_watch import CertificateKeeper
+from plr.protos.program.tls_files import load_tls_files
+from plr.protos.trust.clock_floor import ClockFloor
 from tests.integration.test_tls_gate import PATIENCE_S, opened, until
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
     from pathlib import Path
 
-    from protos.model.ids import NodeName
+    from plr.protos.model.ids import NodeName
     from tests.integration.test_tls_gate import Gate
 
 pytestmark = pytest.mark.audit("ops-19")

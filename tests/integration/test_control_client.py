@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING
 import grpc
 import pytest
 
-from protos.model.ids import (
+from plr.protos.model.ids import (
     PROTOCOL_VERSION,
     InterfaceId,
     InterfaceName,
@@ -29,24 +29,32 @@ from protos.model.ids import (
     SessionId,
     Version,
 )
-from protos.model.mapping import MappingSet
-from protos.model.members import Candidate, CandidateKind, CandidateSet, PeerSet, Registration, ServiceOffer, ServiceSet
-from protos.model.report import OutcomeReport, Report
-from protos.model.stream import Ack, Drain, Heartbeat, Nack, ResourceKind, Welcome
-from protos.plr.v1 import control_pb2
-from sidecar.control import client
-from sidecar.control.client import ControlClient
-from sidecar.core.control import session as control_session
-from sidecar.core.control.session import ControlSession
-from sidecar.net.control_dialer import ControlDialer
+from plr.protos.model.mapping import MappingSet
+from plr.protos.model.members import (
+    Candidate,
+    CandidateKind,
+    CandidateSet,
+    PeerSet,
+    Registration,
+    ServiceOffer,
+    ServiceSet,
+)
+from plr.protos.model.report import OutcomeReport, Report
+from plr.protos.model.stream import Ack, Drain, Heartbeat, Nack, ResourceKind, Welcome
+from plr.protos.plr.v1 import control_pb2
+from plr.sidecar.control import client
+from plr.sidecar.control.client import ControlClient
+from plr.sidecar.core.control import session as control_session
+from plr.sidecar.core.control.session import ControlSession
+from plr.sidecar.net.control_dialer import ControlDialer
 from tests.integration.scripted_control_plane import END, WAIT_S, ScriptedControlPlane
 from tests.support.free_ports import free_port
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from protos.program.tls_files import TlsFiles
-    from sidecar.core.base.report_scope import ReportScope
+    from plr.protos.program.tls_files import TlsFiles
+    from plr.sidecar.core.base.report_scope import ReportScope
 
 WELCOME = Welcome(lease_s=0.6, report_interval_s=0.1, stun_servers=("192.0.2.9:3478",))
 CANDIDATE = Candidate(InterfaceId(0), InterfaceName("wlan0"), CandidateKind.HOST, ("192.0.2.2", 9))
@@ -275,7 +283,7 @@ def test_comes_back_after_an_outage_at_the_same_address() -> None:
 
 SERVER_TO_KILL = """
 import sys, time
-from protos.model.stream import Welcome
+from plr.protos.model.stream import Welcome
 from tests.integration.scripted_control_plane import ScriptedControlPlane
 with ScriptedControlPlane(int(sys.argv[1]), welcome=Welcome(lease_s=3.0, report_interval_s=0.5)) as server:
     sys.stdin.read()

@@ -16,10 +16,10 @@ from typing import TYPE_CHECKING
 
 import yaml
 
-from protos.base.histogram import Histogram
-from protos.model.ids import PROTOCOL_VERSION, InterfaceId, InterfaceName, NodeName, Role, ServiceName, SessionId
-from protos.model.mapping import Assignment, MappingSet
-from protos.model.members import (
+from plr.protos.base.histogram import Histogram
+from plr.protos.model.ids import PROTOCOL_VERSION, InterfaceId, InterfaceName, NodeName, Role, ServiceName, SessionId
+from plr.protos.model.mapping import Assignment, MappingSet
+from plr.protos.model.members import (
     Candidate,
     CandidateKind,
     CandidateSet,
@@ -29,13 +29,13 @@ from protos.model.members import (
     ServiceSet,
     ServiceUse,
 )
-from protos.model.report import PathReport, Report
-from protos.model.stream import ResourceKind, Welcome
-from protos.trust.pair_token import pair_token
-from sidecar.control.client import ControlClient
-from sidecar.core.control import session
-from sidecar.core.control.session import ControlSession
-from sidecar.net.control_dialer import ControlDialer
+from plr.protos.model.report import PathReport, Report
+from plr.protos.model.stream import ResourceKind, Welcome
+from plr.protos.trust.pair_token import pair_token
+from plr.sidecar.control.client import ControlClient
+from plr.sidecar.core.control import session
+from plr.sidecar.core.control.session import ControlSession
+from plr.sidecar.net.control_dialer import ControlDialer
 from tests.integration.scripted_control_plane import WAIT_S
 from tests.support.free_ports import free_port
 
@@ -44,8 +44,8 @@ if TYPE_CHECKING:
 
     import pytest
 
-    from protos.program.tls_files import TlsFiles
-    from sidecar.core.base.report_scope import ReportScope
+    from plr.protos.program.tls_files import TlsFiles
+    from plr.sidecar.core.base.report_scope import ReportScope
 
 ROOT = Path(__file__).parents[2]
 PLAN = ServiceName("/plan_path")
@@ -71,7 +71,7 @@ class ControlPlane:
 
     @contextlib.contextmanager
     def running(self) -> Iterator[None]:
-        argv = [sys.executable, "-m", "controlplane", "--config", str(self._path)]
+        argv = [sys.executable, "-m", "plr.controlplane", "--config", str(self._path)]
         with subprocess.Popen(argv, env={**os.environ, "PYTHONPATH": str(ROOT)}) as process:
             try:
                 self._wait_until_it_listens(process)

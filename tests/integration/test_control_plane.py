@@ -8,13 +8,13 @@ from typing import TYPE_CHECKING
 import grpc
 import pytest
 
-from controlplane.core.publish.snapshots import MAX_LIFTED
-from protos.model.ids import Role
-from protos.model.mapping import MappingSet
-from protos.model.members import PeerSet, RemovalReason
-from protos.model.report import OutcomeReport, Report
-from protos.model.status import SyncState
-from protos.model.stream import Ack, Drain, ResourceKind, Welcome
+from plr.controlplane.core.publish.snapshots import MAX_LIFTED
+from plr.protos.model.ids import Role
+from plr.protos.model.mapping import MappingSet
+from plr.protos.model.members import PeerSet, RemovalReason
+from plr.protos.model.report import OutcomeReport, Report
+from plr.protos.model.status import SyncState
+from plr.protos.model.stream import Ack, Drain, ResourceKind, Welcome
 from tests.support.control_plane_process import ControlPlaneProcess, Stream, cloud, robot
 from tests.support.samples import PLAN, histogram, latency, path, registration
 

@@ -23,7 +23,7 @@ ip neigh add {silent} lladdr 02:00:00:00:00:01 dev silent nud permanent
 mount --bind {folder}/hosts /etc/hosts
 mount --bind {folder}/resolv.conf "$(readlink -f /etc/resolv.conf)"
 cd {root}
-exec {python} -c "from protos.program.entry import plr; raise SystemExit(plr())" \\
+exec {python} -c "from plr.protos.program.entry import plr; raise SystemExit(plr())" \\
   status --insecure --address {address} --timeout-s {timeout_s}
 """
 

@@ -16,7 +16,7 @@ import grpc
 import pytest
 import yaml
 
-from protos.model.stream import Welcome
+from plr.protos.model.stream import Welcome
 from tests.support.control_plane_process import PATIENCE_S, ControlPlaneProcess, cloud
 
 if TYPE_CHECKING:
@@ -45,7 +45,7 @@ def test_a_journal_that_stalls_holds_up_nobody(tmp_path: Path) -> None:
         config["listen"] = f"127.0.0.1:{free.getsockname()[1]}"
     (tmp_path / "controlplane.yaml").write_text(yaml.safe_dump(config))
     process = subprocess.Popen(
-        [sys.executable, "-m", "controlplane", "--config", str(tmp_path / "controlplane.yaml")], stderr=writing
+        [sys.executable, "-m", "plr.controlplane", "--config", str(tmp_path / "controlplane.yaml")], stderr=writing
     )
     try:
         with grpc.insecure_channel(str(config["listen"])) as channel:
@@ -82,7 +82,7 @@ def test_systemd_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Non
 
 def run(*arguments: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run(
-        [sys.executable, "-m", "controlplane", *arguments], capture_output=True, text=True, check=False
+        [sys.executable, "-m", "plr.controlplane", *arguments], capture_output=True, text=True, check=False
     )
 
 
@@ -183,7 +183,7 @@ def test_an_address_in_use_ends_with_1_and_names_the_key(tmp_path: Path, key: st
 
 def test_the_schema_is_printed() -> None:
     done = subprocess.run(
-        [sys.executable, "-m", "controlplane.cli", "config", "schema", "controlplane"],
+        [sys.executable, "-m", "plr.controlplane.cli", "config", "schema", "controlplane"],
         capture_output=True,
         text=True,
         check=True,

@@ -8,10 +8,10 @@ from dataclasses import replace
 import grpc
 import pytest
 
-from protos.convert import sidecar_message_to_proto
-from protos.model.ids import PROTOCOL_VERSION, Role
-from protos.model.stream import Welcome
-from protos.plr.v1 import control_pb2
+from plr.protos.convert import sidecar_message_to_proto
+from plr.protos.model.ids import PROTOCOL_VERSION, Role
+from plr.protos.model.stream import Welcome
+from plr.protos.plr.v1 import control_pb2
 from tests.support.control_plane_process import PATIENCE_S, ControlPlaneProcess, Sidecar, Stream, cloud
 from tests.support.samples import registration
 

@@ -16,15 +16,15 @@ import pytest
 from grpc_health.v1 import health_pb2, health_pb2_grpc
 from grpc_reflection.v1alpha import reflection_pb2, reflection_pb2_grpc
 
-from controlplane.ca import Authority, Validity
-from controlplane.serve.tls_gate import MAX_SILENT_PER_SOURCE
-from protos.model.ids import Role
-from protos.model.mapping import MappingSet
-from protos.model.members import RemovalReason
-from protos.model.report import Report
-from protos.model.stream import Welcome
-from protos.plr.v1 import admin_pb2, admin_pb2_grpc, control_pb2
-from protos.trust.identity import CONTROL_PLANE_DNS, IdentityRole
+from plr.controlplane.ca import Authority, Validity
+from plr.controlplane.serve.tls_gate import MAX_SILENT_PER_SOURCE
+from plr.protos.model.ids import Role
+from plr.protos.model.mapping import MappingSet
+from plr.protos.model.members import RemovalReason
+from plr.protos.model.report import Report
+from plr.protos.model.stream import Welcome
+from plr.protos.plr.v1 import admin_pb2, admin_pb2_grpc, control_pb2
+from plr.protos.trust.identity import CONTROL_PLANE_DNS, IdentityRole
 from tests.support.control_plane_process import PATIENCE_S, Secured, Sidecar, Stream, cloud, open_channel, robot
 from tests.support.samples import registration
 from tests.support.secured_control_plane import HOUR_S, SecuredControlPlane

@@ -16,12 +16,12 @@ import pytest
 from grpc_health.v1 import health_pb2, health_pb2_grpc
 from grpc_reflection.v1alpha import reflection_pb2, reflection_pb2_grpc
 
-from protos.model.mapping import MappingSet
-from protos.model.members import PeerSet
-from protos.model.report import OutcomeReport, Report
-from protos.model.status import SyncState
-from protos.model.stream import Heartbeat
-from protos.stun.codec import MessageClass, StunMessage, decode, encode
+from plr.protos.model.mapping import MappingSet
+from plr.protos.model.members import PeerSet
+from plr.protos.model.report import OutcomeReport, Report
+from plr.protos.model.status import SyncState
+from plr.protos.model.stream import Heartbeat
+from plr.protos.stun.codec import MessageClass, StunMessage, decode, encode
 from tests.support.control_plane_process import PATIENCE_S, ControlPlaneProcess, cloud, robot
 from tests.support.samples import PLAN, histogram, path
 
@@ -90,7 +90,7 @@ def test_status_as_a_table_and_as_json(plane: ControlPlaneProcess) -> None:
         r.nack(r.expect(PeerSet, lambda message: bool(message.peers)), "not\nthis\tone")
         plane.wait_for_state("robot", SyncState.REJECTED)
         table = subprocess.run(
-            [sys.executable, "-m", "controlplane.cli", "status", "--insecure", "--address", plane.address],
+            [sys.executable, "-m", "plr.controlplane.cli", "status", "--insecure", "--address", plane.address],
             capture_output=True,
             text=True,
             check=True,
@@ -99,7 +99,7 @@ def test_status_as_a_table_and_as_json(plane: ControlPlaneProcess) -> None:
             [
                 sys.executable,
                 "-m",
-                "controlplane.cli",
+                "plr.controlplane.cli",
                 "status",
                 "--insecure",
                 "--address",
@@ -126,7 +126,7 @@ def test_status_as_a_table_and_as_json(plane: ControlPlaneProcess) -> None:
 def test_plr_status_imports_only_what_it_needs(plane: ControlPlaneProcess) -> None:
     """Names, not times: what is imported takes most of the time that the command takes."""
     program = (
-        "import sys; from controlplane.cli.__main__ import main;"
+        "import sys; from plr.controlplane.cli.__main__ import main;"
         f"code = main(['status', '--insecure', '--address', {plane.address!r}, '--timeout-s', '30']);"
         "print('IMPORTED', *sys.modules); sys.exit(code)"
     )
@@ -142,7 +142,17 @@ def test_plr_status_imports_only_what_it_needs(plane: ControlPlaneProcess) -> No
     assert "wlan0 -> cloud-a" in text
     modules = set(names.split())
     heavy = ("numpy", "pydantic", "yaml", "ortools", "pandas", "matplotlib", "prometheus_client", "grpc_health.v1")
-    rest = ("grpc_reflection.v1alpha", "google.protobuf.json_format", "controlplane.ca", "controlplane.planning")
-    ours = ("controlplane.config.controlplane", "controlplane.core", "controlplane.loop", "controlplane.version")
+    rest = (
+        "grpc_reflection.v1alpha",
+        "google.protobuf.json_format",
+        "plr.controlplane.ca",
+        "plr.controlplane.planning",
+    )
+    ours = (
+        "plr.controlplane.config.controlplane",
+        "plr.controlplane.core",
+        "plr.controlplane.loop",
+        "controlplane.version",
+    )
     assert modules & {*heavy, *rest, *ours} == set()
-    assert {"grpc", "controlplane.cli.status_command"} <= modules
+    assert {"grpc", "plr.controlplane.cli.status_command"} <= modules

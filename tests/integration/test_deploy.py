@@ -15,20 +15,20 @@ from typing import TYPE_CHECKING, Any
 import pytest
 import yaml
 
-from controlplane.__main__ import EXIT_USAGE
-from controlplane.cli.__main__ import main as plr
-from controlplane.config.controlplane import load_config as load_controlplane_config
-from controlplane.core.control.control import ControlCore
-from controlplane.observe.fleet_metrics import Fleet
-from controlplane.observe.metrics import Metrics
-from protos.base.host_port import split_host_port
-from protos.model.ids import NodeName, Role
-from protos.trust.identity import Identity, IdentityRole, RevocationList
-from sidecar.config.sidecar import SidecarConfig, load_config
-from sidecar.control.revocations import RevocationState
-from sidecar.core.control.session import ControlStats
-from sidecar.core.seam.stats import EngineStats
-from sidecar.observe.metrics import MetricSources, SidecarCollector
+from plr.controlplane.__main__ import EXIT_USAGE
+from plr.controlplane.cli.__main__ import main as plr
+from plr.controlplane.config.controlplane import load_config as load_controlplane_config
+from plr.controlplane.core.control.control import ControlCore
+from plr.controlplane.observe.fleet_metrics import Fleet
+from plr.controlplane.observe.metrics import Metrics
+from plr.protos.base.host_port import split_host_port
+from plr.protos.model.ids import NodeName, Role
+from plr.protos.trust.identity import Identity, IdentityRole, RevocationList
+from plr.sidecar.config.sidecar import SidecarConfig, load_config
+from plr.sidecar.control.revocations import RevocationState
+from plr.sidecar.core.control.session import ControlStats
+from plr.sidecar.core.seam.stats import EngineStats
+from plr.sidecar.observe.metrics import MetricSources, SidecarCollector
 from tests.support.free_ports import free_port
 
 if TYPE_CHECKING:

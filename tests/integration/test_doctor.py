@@ -16,12 +16,12 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from controlplane.ca import Authority
-from protos.program import commit
-from protos.trust.identity import IdentityRole
-from sidecar.doctor import command, ping_command
-from sidecar.local.client import LocalClient
-from sidecar.state.file import decode_identity
+from plr.controlplane.ca import Authority
+from plr.protos.program import commit
+from plr.protos.trust.identity import IdentityRole
+from plr.sidecar.doctor import command, ping_command
+from plr.sidecar.local.client import LocalClient
+from plr.sidecar.state.file import decode_identity
 from tests.integration.test_sidecar_program import Program, environment
 from tests.support.control_plane_process import ControlPlaneProcess
 from tests.support.free_ports import free_port
@@ -36,7 +36,7 @@ pytestmark = [pytest.mark.audit("ops-14"), pytest.mark.ros]
 
 
 def plr(*arguments: str) -> subprocess.CompletedProcess[str]:
-    argv = [sys.executable, "-m", "protos.program.command_line", *arguments]
+    argv = [sys.executable, "-m", "plr.protos.program.command_line", *arguments]
     return subprocess.run(argv, capture_output=True, text=True, timeout=100, env=environment())
 
 
@@ -133,7 +133,7 @@ def test_without_sidecar_the_doctor_says_so_first_and_looks_at_the_rest(tmp_path
 def test_a_wrong_configuration_is_a_failure_with_its_key(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("sidecar.ros.environment.problem", lambda *_, **__: None)
+    monkeypatch.setattr("plr.sidecar.ros.environment.problem", lambda *_, **__: None)
     program = Program(tmp_path, deadline=1)
     assert command.main(["--config", str(program.path)]) == 1
     assert "deadline: unknown key" in capsys.readouterr().out

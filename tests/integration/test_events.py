@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Any
 import grpc
 import pytest
 
-from controlplane.cli.__main__ import main
-from protos.trust.identity import IdentityRole
+from plr.controlplane.cli.__main__ import main
+from plr.protos.trust.identity import IdentityRole
 from tests.support.control_plane_process import HEARTBEAT_S, PATIENCE_S, ControlPlaneProcess, Sidecar, cloud, robot
 from tests.support.secured_control_plane import SecuredControlPlane
 

@@ -7,9 +7,9 @@ import json
 import grpc
 import pytest
 
-from controlplane.cli.__main__ import main
-from protos.model.report import Report
-from protos.plr.v1 import admin_pb2, admin_pb2_grpc
+from plr.controlplane.cli.__main__ import main
+from plr.protos.model.report import Report
+from plr.protos.plr.v1 import admin_pb2, admin_pb2_grpc
 from tests.support.control_plane_process import PATIENCE_S, ControlPlaneProcess, cloud, robot
 from tests.support.samples import histogram, latency, path
 

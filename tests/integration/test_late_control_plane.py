@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from protos.model.members import PeerSet
-from protos.trust.identity import IdentityRole
+from plr.protos.model.members import PeerSet
+from plr.protos.trust.identity import IdentityRole
 from tests.support.control_plane_process import PATIENCE_S, cloud, robot
 from tests.support.secured_control_plane import SecuredControlPlane
 

@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from protos.model.ids import NodeName, ServiceName
-from protos.model.members import NO_POLICY, RemovalReason, RemovedPeer
+from plr.protos.model.ids import NodeName, ServiceName
+from plr.protos.model.members import NO_POLICY, RemovalReason, RemovedPeer
 from tests.support.control_plane_process import ControlPlaneProcess, cloud, robot
 
 if TYPE_CHECKING:

@@ -11,22 +11,22 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from controlplane.ca import Authority, Validity
-from controlplane.ca.files import write_atomically
-from protos.model.ids import Role
-from protos.model.members import PeerSet, ServiceSet
-from protos.model.report import Report
-from protos.model.stream import ResourceKind, Welcome
-from protos.program.tls_files import TlsWatch, load_tls_files
-from protos.trust.candidate_signature import verify_candidates
-from protos.trust.credential import decode_credential
-from protos.trust.identity import CertificateError, IdentityRole
-from protos.trust.revocation_views import revocation_set
-from sidecar.control import client
-from sidecar.control.announcement import Announcer
-from sidecar.control.client import ControlClient
-from sidecar.core.control.session import ControlSession
-from sidecar.net.control_dialer import ControlDialer
+from plr.controlplane.ca import Authority, Validity
+from plr.controlplane.ca.files import write_atomically
+from plr.protos.model.ids import Role
+from plr.protos.model.members import PeerSet, ServiceSet
+from plr.protos.model.report import Report
+from plr.protos.model.stream import ResourceKind, Welcome
+from plr.protos.program.tls_files import TlsWatch, load_tls_files
+from plr.protos.trust.candidate_signature import verify_candidates
+from plr.protos.trust.credential import decode_credential
+from plr.protos.trust.identity import CertificateError, IdentityRole
+from plr.protos.trust.revocation_views import revocation_set
+from plr.sidecar.control import client
+from plr.sidecar.control.announcement import Announcer
+from plr.sidecar.control.client import ControlClient
+from plr.sidecar.core.control.session import ControlSession
+from plr.sidecar.net.control_dialer import ControlDialer
 from tests.support.control_plane_process import (
     PATIENCE_S,
     ControlPlaneProcess,
@@ -43,9 +43,9 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
     from pathlib import Path
 
-    from protos.model.mapping import MappingSet
-    from protos.program.tls_files import TlsFiles
-    from sidecar.core.base.report_scope import ReportScope
+    from plr.protos.model.mapping import MappingSet
+    from plr.protos.program.tls_files import TlsFiles
+    from plr.sidecar.core.base.report_scope import ReportScope
 
 
 @pytest.fixture(scope="module")
@@ -254,7 +254,7 @@ def test_a_name_that_is_not_the_certificates_is_refused_in_words(plane: SecuredC
 
 
 def plr(*arguments: str) -> subprocess.CompletedProcess[str]:
-    argv = [sys.executable, "-m", "controlplane.cli", *arguments]
+    argv = [sys.executable, "-m", "plr.controlplane.cli", *arguments]
     return subprocess.run(argv, capture_output=True, text=True, check=False)
 
 

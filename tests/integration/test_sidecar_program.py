@@ -17,11 +17,11 @@ from typing import TYPE_CHECKING, Any
 import pytest
 import yaml
 
-from protos.model.ids import InterfaceName, NodeName, Role, ServiceName, SessionId, Version
-from protos.model.mapping import Assignment, MappingSet, ServiceMapping
-from protos.model.members import CandidateSet, InterfaceLabel, Peer, PeerSet, Registration
-from protos.model.stream import Welcome
-from sidecar.state.store import StateStore
+from plr.protos.model.ids import InterfaceName, NodeName, Role, ServiceName, SessionId, Version
+from plr.protos.model.mapping import Assignment, MappingSet, ServiceMapping
+from plr.protos.model.members import CandidateSet, InterfaceLabel, Peer, PeerSet, Registration
+from plr.protos.model.stream import Welcome
+from plr.sidecar.state.store import StateStore
 from tests.integration.scripted_control_plane import WAIT_S, ScriptedControlPlane
 from tests.support.free_ports import free_port
 from tests.support.sessions import with_credential
@@ -39,7 +39,7 @@ def environment() -> dict[str, str]:
 
 
 def run(*arguments: str) -> subprocess.CompletedProcess[str]:
-    argv = [sys.executable, "-m", "sidecar", *arguments]
+    argv = [sys.executable, "-m", "plr.sidecar", *arguments]
     return subprocess.run(argv, capture_output=True, text=True, timeout=60, env=environment())
 
 
@@ -65,7 +65,7 @@ class Program:
 
     def start(self) -> None:
         with self._log_path.open("wb") as log:
-            argv = [sys.executable, "-m", "sidecar", "--config", str(self.path)]
+            argv = [sys.executable, "-m", "plr.sidecar", "--config", str(self.path)]
             self._process = subprocess.Popen(argv, stderr=log, env=environment())
 
     @property
@@ -195,8 +195,8 @@ class Runtime(types.ModuleType):
         signal.raise_signal(signal.SIGTERM)
         return lambda config, version, stop: print("stopped", stop.wait(60.0)) or 0
 
-sys.modules["sidecar.runtime"] = Runtime("sidecar.runtime")
-from sidecar.__main__ import main
+sys.modules["plr.sidecar.runtime"] = Runtime("plr.sidecar.runtime")
+from plr.sidecar.__main__ import main
 sys.exit(main(sys.argv[1:]))
 """
 

@@ -16,11 +16,11 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from controlplane.core.stun.responder import StunOutcome
-from controlplane.serve.stun_server import SHARE, StunServer, start_stun_server
-from protos.stun.codec import MessageClass, StunMessage, decode, encode
-from sidecar.core.stun.client import StunClient
-from sidecar.core.stun.events import Mapped, StunEvent
+from plr.controlplane.core.stun.responder import StunOutcome
+from plr.controlplane.serve.stun_server import SHARE, StunServer, start_stun_server
+from plr.protos.stun.codec import MessageClass, StunMessage, decode, encode
+from plr.sidecar.core.stun.client import StunClient
+from plr.sidecar.core.stun.events import Mapped, StunEvent
 from tests.support.free_ports import free_port
 
 if TYPE_CHECKING:

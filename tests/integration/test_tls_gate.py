@@ -14,13 +14,13 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from controlplane.ca import Authority
-from controlplane.serve import tls_gate
-from controlplane.serve.tls_gate import TlsGate
-from protos.model.ids import NodeName
-from protos.program.tls_files import load_tls_files
-from protos.trust.clock_floor import ClockFloor
-from protos.trust.identity import CONTROL_PLANE_DNS, IdentityRole
+from plr.controlplane.ca import Authority
+from plr.controlplane.serve import tls_gate
+from plr.controlplane.serve.tls_gate import TlsGate
+from plr.protos.model.ids import NodeName
+from plr.protos.program.tls_files import load_tls_files
+from plr.protos.trust.clock_floor import ClockFloor
+from plr.protos.trust.identity import CONTROL_PLANE_DNS, IdentityRole
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable

@@ -24,17 +24,17 @@ import sys
 import time
 from typing import TYPE_CHECKING, Any
 
-from protos.model.ids import InterfaceName
-from sidecar.core.link.sender import Batch
-from sidecar.core.seam.stats import LinkStats
-from sidecar.net.batch_socket import BatchSocket
-from sidecar.net.interfaces import Interface, choose, list_interfaces
-from sidecar.net.sockets import DataSocket, normalise, open_socket, to_sockaddr
+from plr.protos.model.ids import InterfaceName
+from plr.sidecar.core.link.sender import Batch
+from plr.sidecar.core.seam.stats import LinkStats
+from plr.sidecar.net.batch_socket import BatchSocket
+from plr.sidecar.net.interfaces import Interface, choose, list_interfaces
+from plr.sidecar.net.sockets import DataSocket, normalise, open_socket, to_sockaddr
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from protos.model.ids import Address
+    from plr.protos.model.ids import Address
 
 LINKS = {"wlan0": 1, "wwan0": 2}
 ECHO: dict[int, Address] = {4: ("10.9.9.9", 5000), 6: ("fd00:9::9", 5000)}

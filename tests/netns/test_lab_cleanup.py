@@ -147,6 +147,9 @@ def world_readable_copy() -> Iterator[Path]:
     folder = Path(tempfile.mkdtemp(prefix="lab-test-"))
     for package in ("lab", "controlplane", "protos"):  # it reads traces as `plr plan` does
         shutil.copytree(REPOSITORY / package, folder / package, ignore=shutil.ignore_patterns("__pycache__"))
+    (folder / "plr").mkdir()
+    for package in ("controlplane", "protos"):
+        (folder / "plr" / package).symlink_to(f"../{package}")
     for path in (folder, *folder.rglob("*")):
         path.chmod(0o755 if path.is_dir() else 0o644)
     yield folder

@@ -9,7 +9,7 @@ import pytest
 
 from bench.dataplane.ours import Ours
 from lab import HostSpec, InterfaceSpec, Lab, LabConfig, server
-from sidecar.core.path.pmtu import COMMON_MTUS, HEADERS_V4, HEADERS_V6
+from plr.sidecar.core.path.pmtu import COMMON_MTUS, HEADERS_V4, HEADERS_V6
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

@@ -8,7 +8,7 @@ import pytest
 
 from lab import Lab, LabConfig
 from lab.system import System
-from protos.trust.identity import IdentityRole
+from plr.protos.trust.identity import IdentityRole
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -18,9 +18,9 @@ import urllib.request
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from controlplane.ca import Authority
-from controlplane.ca.files import write_tls_files
-from protos.trust.identity import IdentityRole
+from plr.controlplane.ca import Authority
+from plr.controlplane.ca.files import write_tls_files
+from plr.protos.trust.identity import IdentityRole
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -131,7 +131,7 @@ def start(name: str, folder: Path) -> tuple[subprocess.Popen[bytes], socket.sock
                 *(f"--{kind}-caps=-all,{capabilities}" for kind in ("inh", "ambient")),
                 f"--bounding-set=-all,{capabilities}",
                 *(sys.executable, SANDBOX, DEPLOY / "systemd" / f"plr-{name}.service"),
-                *(sys.executable, "-m", name, "--config", folder / f"{name}.json"),
+                *(sys.executable, "-m", f"plr.{name}", "--config", folder / f"{name}.json"),
             ],
             env=environment,
             cwd=ROOT,

@@ -7,9 +7,9 @@ import signal
 import sys
 import threading
 
-from protos.model.ids import Role
-from sidecar.core.rules.service_rule import ServiceRule
-from sidecar.ros.bridge import RosBridge
+from plr.protos.model.ids import Role
+from plr.sidecar.core.rules.service_rule import ServiceRule
+from plr.sidecar.ros.bridge import RosBridge
 from tests.ros.loopback import Loopback
 
 

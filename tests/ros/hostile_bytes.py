@@ -23,8 +23,8 @@ from rclpy.type_support import check_for_type_support
 from sensor_msgs.msg import CompressedImage, PointCloud2
 from std_srvs.srv import Empty, SetBool, Trigger
 
-from sidecar.ros.errors import RosBridgeError
-from sidecar.ros.rcl import MessageType
+from plr.sidecar.ros.errors import RosBridgeError
+from plr.sidecar.ros.rcl import MessageType
 
 HUGE_BYTES = 16 << 20
 """The longest request (docs/operate/limits.md)."""

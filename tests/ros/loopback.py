@@ -11,10 +11,10 @@ from collections import Counter
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
-from protos.model.ids import InterfaceName, NodeName, ServiceName, SessionId
-from protos.model.mapping import Assignment
-from sidecar.core.base.values import ExecutionId, Priority
-from sidecar.core.seam.application import (
+from plr.protos.model.ids import InterfaceName, NodeName, ServiceName, SessionId
+from plr.protos.model.mapping import Assignment
+from plr.sidecar.core.base.values import ExecutionId, Priority
+from plr.sidecar.core.seam.application import (
     AbandonExecution,
     DeadlineMissed,
     ExecuteRequest,
@@ -27,9 +27,9 @@ from sidecar.core.seam.application import (
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
 
-    from protos.model.members import ServiceOffer
-    from sidecar.core.base.values import RejectReason, RequestId
-    from sidecar.ports import Application
+    from plr.protos.model.members import ServiceOffer
+    from plr.sidecar.core.base.values import RejectReason, RequestId
+    from plr.sidecar.ports import Application
 
 log = logging.getLogger(__name__)
 

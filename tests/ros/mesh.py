@@ -11,9 +11,9 @@ import threading
 import time
 from typing import TYPE_CHECKING, Any
 
-from protos.model.ids import Role
-from sidecar.core.rules.service_rule import ServiceRule
-from sidecar.ros.bridge import RosBridge
+from plr.protos.model.ids import Role
+from plr.sidecar.core.rules.service_rule import ServiceRule
+from plr.sidecar.ros.bridge import RosBridge
 from tests.ros.loopback import Faults, Loopback
 from tests.ros.processes import Program
 

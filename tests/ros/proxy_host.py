@@ -7,10 +7,10 @@ import signal
 import sys
 import threading
 
-from protos.model.ids import Role, ServiceName
-from sidecar.core.rules.service_rule import ServiceRule
-from sidecar.core.seam.application import OfferService
-from sidecar.ros.bridge import RosBridge
+from plr.protos.model.ids import Role, ServiceName
+from plr.sidecar.core.rules.service_rule import ServiceRule
+from plr.sidecar.core.seam.application import OfferService
+from plr.sidecar.ros.bridge import RosBridge
 from tests.ros.loopback import Loopback
 from tests.ros.mesh import wait_until
 

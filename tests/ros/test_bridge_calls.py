@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from protos.model.ids import ServiceName
-from sidecar.ros import rcl
+from plr.protos.model.ids import ServiceName
+from plr.sidecar.ros import rcl
 
 if TYPE_CHECKING:
     from tests.ros.mesh import Mesh
@@ -98,7 +98,7 @@ def test_answers_to_a_client_that_is_only_half_discovered_wait(mesh: Mesh, monke
             raise rcl.NewClientError("client will not receive response")
         send(*arguments)
 
-    monkeypatch.setattr("sidecar.ros.robot.service_proxy.send_response", busy)
+    monkeypatch.setattr("plr.sidecar.ros.robot.service_proxy.send_response", busy)
     mesh.start()
     mesh.serve("--plan", "/plan", "--deep")
     mesh.wait_carried("/plan")

@@ -11,10 +11,10 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from protos.model.ids import ServiceName
-from sidecar.core.base.values import RejectReason
-from sidecar.core.seam.application import AbandonExecution, CancelExecution
-from sidecar.ros.graph import graph
+from plr.protos.model.ids import ServiceName
+from plr.sidecar.core.base.values import RejectReason
+from plr.sidecar.core.seam.application import AbandonExecution, CancelExecution
+from plr.sidecar.ros.graph import graph
 from tests.ros.loopback import ROBOT
 from tests.ros.mesh import no_name, wait_until
 from tests.ros.notice_listener import NoticeListener
@@ -127,15 +127,17 @@ def test_a_service_comes_goes_and_comes_back(mesh: Mesh) -> None:
 
 def test_a_server_restarted_between_two_looks(mesh: Mesh, monkeypatch: pytest.MonkeyPatch) -> None:
     """The name never leaves the graph: only the server's endpoint tells that the old requests are lost."""
-    monkeypatch.setattr("sidecar.ros.cloud.server_processes.ServerProcesses.watch", lambda _processes, _endpoint: None)
+    monkeypatch.setattr(
+        "plr.sidecar.ros.cloud.server_processes.ServerProcesses.watch", lambda _processes, _endpoint: None
+    )
     mesh.start()
     old = mesh.serve("--plan", "/plan")
     mesh.wait_carried("/plan")
     mesh.call("/plan", "--count", "4", "--tolerance", "-1", "--timeout-s", "1")
     wait_until(lambda: mesh.cloud.stats.pending == 4, "4 requests at the server")
     with monkeypatch.context() as blind:
-        blind.setattr("sidecar.ros.graph.looks.Looks.turn", lambda _looks, _now: None)
-        blind.setattr("sidecar.ros.graph.looks.Looks.next_due", lambda _looks: time.monotonic() + 0.1)
+        blind.setattr("plr.sidecar.ros.graph.looks.Looks.turn", lambda _looks, _now: None)
+        blind.setattr("plr.sidecar.ros.graph.looks.Looks.next_due", lambda _looks: time.monotonic() + 0.1)
         old.stop(signal.SIGTERM)
         mesh.serve("--plan", "/plan")
         node = mesh.cloud._loop.node  # type: ignore[union-attr]  # a started bridge has one
@@ -196,7 +198,7 @@ def test_withdrawn_with_requests_in_flight(mesh: Mesh) -> None:
 
 
 def test_missed_deadlines_and_failures_are_published(mesh: Mesh, caplog: pytest.LogCaptureFixture) -> None:
-    caplog.set_level(logging.WARNING, "sidecar")
+    caplog.set_level(logging.WARNING, "plr.sidecar")
     mesh.faults.deadline_s = 0.2
     mesh.faults.lifetime_s = 1.0
     mesh.start()

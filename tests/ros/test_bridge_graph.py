@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from protos.model.ids import Role, ServiceName
-from sidecar.core.rules.service_rule import ServiceRule
-from sidecar.core.seam.application import OfferService
-from sidecar.ros.bridge import RosBridge
-from sidecar.ros.graph import graph
+from plr.protos.model.ids import Role, ServiceName
+from plr.sidecar.core.rules.service_rule import ServiceRule
+from plr.sidecar.core.seam.application import OfferService
+from plr.sidecar.ros.bridge import RosBridge
+from plr.sidecar.ros.graph import graph
 from tests.ros.loopback import Loopback
 from tests.ros.mesh import RULES, no_name, wait_until
 
@@ -29,7 +29,7 @@ PLAN_TYPE = "nav_msgs/srv/GetPlan"
 @pytest.fixture
 def often(monkeypatch: pytest.MonkeyPatch) -> None:
     """Look at the graph often also while it does not change."""
-    monkeypatch.setattr("sidecar.ros.graph.looks.IDLE_PERIOD_S", 0.1)
+    monkeypatch.setattr("plr.sidecar.ros.graph.looks.IDLE_PERIOD_S", 0.1)
 
 
 def scanned(node: Any) -> dict[ServiceName, graph.Served]:
@@ -67,7 +67,7 @@ def test_a_server_whose_qos_does_not_fit_is_told_from_none(mesh: Mesh) -> None:
 
 
 def test_a_name_that_is_served_on_the_robot_is_left_alone(mesh: Mesh, caplog: pytest.LogCaptureFixture) -> None:
-    caplog.set_level(logging.INFO, "sidecar")
+    caplog.set_level(logging.INFO, "plr.sidecar")
     mesh.start()
     own = mesh.serve("--plan", "/plan", "--node", "own_planner", domain=mesh.robot_domain)
     mesh.serve("--plan", "/plan", "--negate", "/negate")
@@ -100,7 +100,7 @@ def test_a_server_that_appears_on_the_robot_takes_over(mesh: Mesh) -> None:
 @pytest.mark.audit("dp-16")
 def test_servers_whose_nodes_share_a_name_are_all_carried(mesh: Mesh, caplog: pytest.LogCaptureFixture) -> None:
     """As when one program is started twice: rmw, asked by node name, shows the services of one of them only."""
-    caplog.set_level(logging.WARNING, "sidecar")
+    caplog.set_level(logging.WARNING, "plr.sidecar")
     mesh.start()
     mesh.serve("--plan", "/plan")
     mesh.serve("--negate", "/negate")
@@ -119,7 +119,7 @@ def test_servers_whose_nodes_share_a_name_are_all_carried(mesh: Mesh, caplog: py
 def test_two_servers_of_a_service_are_told_of_though_their_nodes_share_a_name(
     mesh: Mesh, caplog: pytest.LogCaptureFixture
 ) -> None:
-    caplog.set_level(logging.WARNING, "sidecar")
+    caplog.set_level(logging.WARNING, "plr.sidecar")
     mesh.start()
     mesh.serve("--plan", "/plan")
     mesh.serve("--plan", "/plan")
@@ -201,7 +201,7 @@ def test_a_type_that_is_not_installed_on_the_robot(mesh: Mesh, caplog: pytest.Lo
 def test_a_type_that_is_installed_later(
     mesh: Mesh, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    monkeypatch.setattr("sidecar.ros.cloud.cloud_side.TYPE_RETRY_S", 0.3)
+    monkeypatch.setattr("plr.sidecar.ros.cloud.cloud_side.TYPE_RETRY_S", 0.3)
     with monkeypatch.context() as without:
         without.delitem(sys.modules, "std_srvs.srv", raising=False)
         without.setitem(sys.modules, "std_srvs", None)  # importing it fails, as when it is not installed

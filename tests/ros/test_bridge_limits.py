@@ -6,12 +6,12 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from protos.model.ids import NodeName, ServiceName, SessionId
-from sidecar.core.base.values import RejectReason
-from sidecar.core.rules.service_rule import ServiceRule
-from sidecar.core.seam.application import OfferService
-from sidecar.ros.rcl import RmwRequestId
-from sidecar.ros.robot.request_numbering import RequestNumbering
+from plr.protos.model.ids import NodeName, ServiceName, SessionId
+from plr.sidecar.core.base.values import RejectReason
+from plr.sidecar.core.rules.service_rule import ServiceRule
+from plr.sidecar.core.seam.application import OfferService
+from plr.sidecar.ros.rcl import RmwRequestId
+from plr.sidecar.ros.robot.request_numbering import RequestNumbering
 from tests.ros.mesh import wait_until
 
 if TYPE_CHECKING:
@@ -23,7 +23,7 @@ PLAN = ServiceName("/plan")
 
 
 def test_more_requests_than_a_robot_may_have_pending(mesh: Mesh, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("sidecar.ros.robot.robot_side.MAX_PENDING_REQUESTS", 10)
+    monkeypatch.setattr("plr.sidecar.ros.robot.robot_side.MAX_PENDING_REQUESTS", 10)
     mesh.faults.delay_s = lambda: 0.5
     mesh.start()
     mesh.serve("--plan", "/plan")
@@ -35,7 +35,7 @@ def test_more_requests_than_a_robot_may_have_pending(mesh: Mesh, monkeypatch: py
 
 
 def test_more_requests_than_a_server_may_have(mesh: Mesh, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("sidecar.ros.cloud.cloud_side.MAX_EXECUTIONS", 20)
+    monkeypatch.setattr("plr.sidecar.ros.cloud.cloud_side.MAX_EXECUTIONS", 20)
     mesh.start()
     mesh.serve("--plan", "/plan")
     mesh.wait_carried("/plan")
@@ -47,7 +47,7 @@ def test_more_requests_than_a_server_may_have(mesh: Mesh, monkeypatch: pytest.Mo
 
 def test_a_robot_that_fills_its_share_leaves_the_others_theirs(mesh: Mesh, monkeypatch: pytest.MonkeyPatch) -> None:
     """Its requests lie at a slow server; the other robot asks another one, which is idle."""
-    monkeypatch.setattr("sidecar.ros.cloud.cloud_side.MAX_EXECUTIONS", 20)
+    monkeypatch.setattr("plr.sidecar.ros.cloud.cloud_side.MAX_EXECUTIONS", 20)
     mesh.start()
     mesh.serve("--plan", "/plan")
     mesh.serve("--plan", "/slow", "--busy-s", "0.5")

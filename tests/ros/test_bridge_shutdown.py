@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from protos.model.ids import Role
-from sidecar.core.base.values import RejectReason
-from sidecar.ros.bridge import RosBridge
+from plr.protos.model.ids import Role
+from plr.sidecar.core.base.values import RejectReason
+from plr.sidecar.ros.bridge import RosBridge
 from tests.ros.mesh import wait_until
 from tests.ros.processes import Program
 

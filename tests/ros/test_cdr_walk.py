@@ -20,9 +20,9 @@ from rclpy.type_support import check_for_type_support
 from rosidl_parser import definition
 from sensor_msgs.msg import CompressedImage, Image
 
-from sidecar.ros import cdr_walk
-from sidecar.ros.cdr_layouts import layout_of
-from sidecar.ros.cdr_walk import CdrError, Layout, check
+from plr.sidecar.ros import cdr_walk
+from plr.sidecar.ros.cdr_layouts import layout_of
+from plr.sidecar.ros.cdr_walk import CdrError, Layout, check
 
 pytestmark = [pytest.mark.ros, pytest.mark.audit("sec-3")]
 

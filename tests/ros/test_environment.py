@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from sidecar.__main__ import main
-from sidecar.ros import environment
+from plr.sidecar.__main__ import main
+from plr.sidecar.ros import environment
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -111,7 +111,7 @@ def test_a_library_that_rclpy_does_not_find_is_named_in_one_line(tmp_path: Path,
         "raise ImportError('librcl.so: cannot open shared object file: No such file or directory\\nsee elsewhere')\n"
     )
     (tmp_path / "rclpy" / f"_rclpy_pybind11{EXTENSION_SUFFIXES[0]}").touch()
-    argv = [sys.executable, "-m", "sidecar", "--config", str(config), *(["--check-config"] if check else [])]
+    argv = [sys.executable, "-m", "plr.sidecar", "--config", str(config), *(["--check-config"] if check else [])]
     environ = {**os.environ, "PYTHONPATH": str(tmp_path)}
     done = subprocess.run(argv, env=environ, capture_output=True, text=True, timeout=120, check=False)
     assert done.returncode == 2

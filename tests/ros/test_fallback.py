@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from protos.model.ids import ServiceName
-from sidecar.core.rules.service_rule import FallbackRule, ServiceRule
+from plr.protos.model.ids import ServiceName
+from plr.sidecar.core.rules.service_rule import FallbackRule, ServiceRule
 from tests.ros.mesh import wait_until
 
 if TYPE_CHECKING:
@@ -57,8 +57,8 @@ def test_without_any_network_the_fallback_answers_in_time_also_after_a_crash(mes
 def test_a_network_that_answers_leaves_nothing_to_do_and_both_make_one_answer(
     mesh: Mesh, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("sidecar.ros.robot.fallback_caller.COMPLAIN_AFTER_S", 0.0)
-    caplog.set_level(logging.ERROR, "sidecar.ros.robot.fallback_caller")
+    monkeypatch.setattr("plr.sidecar.ros.robot.fallback_caller.COMPLAIN_AFTER_S", 0.0)
+    caplog.set_level(logging.ERROR, "plr.sidecar.ros.robot.fallback_caller")
     start(mesh, takes_s=0.5)
     mesh.serve("--plan", PLAN, "--node", "in_the_cloud")
     mesh.wait_carried(PLAN)

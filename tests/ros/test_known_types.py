@@ -6,13 +6,13 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from protos.model.ids import NodeName, Role, ServiceName, SessionId, Version
-from protos.model.members import Peer, PeerSet, ServiceOffer
-from sidecar.__main__ import main
-from sidecar.core.rules.service_rule import ServiceRule
-from sidecar.ros.graph.known_types import MAX_LINES, missing_types
-from sidecar.state.file import LastGood, encode_last_good
-from sidecar.state.store import LAST_GOOD_FILE
+from plr.protos.model.ids import NodeName, Role, ServiceName, SessionId, Version
+from plr.protos.model.members import Peer, PeerSet, ServiceOffer
+from plr.sidecar.__main__ import main
+from plr.sidecar.core.rules.service_rule import ServiceRule
+from plr.sidecar.ros.graph.known_types import MAX_LINES, missing_types
+from plr.sidecar.state.file import LastGood, encode_last_good
+from plr.sidecar.state.store import LAST_GOOD_FILE
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -11,17 +11,17 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from protos.model.ids import ServiceName
-from sidecar.core.base.values import RejectReason
-from sidecar.ros.cloud import dds_id, process_finder, server_processes
-from sidecar.ros.cloud.cloud_side import SILENCE_S
-from sidecar.ros.cloud.process_finder import has_ended, open_process, wants_processor
-from sidecar.ros.cloud.roll_call import CALL_S
-from sidecar.ros.graph import graph
+from plr.protos.model.ids import ServiceName
+from plr.sidecar.core.base.values import RejectReason
+from plr.sidecar.ros.cloud import dds_id, process_finder, server_processes
+from plr.sidecar.ros.cloud.cloud_side import SILENCE_S
+from plr.sidecar.ros.cloud.process_finder import has_ended, open_process, wants_processor
+from plr.sidecar.ros.cloud.roll_call import CALL_S
+from plr.sidecar.ros.graph import graph
 from tests.ros.mesh import no_name, wait_until
 
 if TYPE_CHECKING:
-    from sidecar.ros.ros_loop import RosLoop
+    from plr.sidecar.ros.ros_loop import RosLoop
     from tests.ros.mesh import Mesh
 
 pytestmark = pytest.mark.ros
@@ -43,7 +43,7 @@ def endpoints(mesh: Mesh) -> set[bytes]:
 
 def blind(monkeypatch: pytest.MonkeyPatch) -> None:
     """As if every server ran in a container: no process id means anything."""
-    monkeypatch.setattr("sidecar.ros.cloud.server_processes.open_process", lambda _endpoint, _domain: None)
+    monkeypatch.setattr("plr.sidecar.ros.cloud.server_processes.open_process", lambda _endpoint, _domain: None)
 
 
 @pytest.mark.audit("dp-15")
@@ -226,7 +226,7 @@ def test_silence_that_tells_nothing_is_no_death(mesh: Mesh, monkeypatch: pytest.
     server = mesh.serve("--plan", "/plan")
     mesh.wait_carried("/plan")
     if why == "it waits for a processor":
-        monkeypatch.setattr("sidecar.ros.cloud.server_processes.wants_processor", lambda _pidfd: True)
+        monkeypatch.setattr("plr.sidecar.ros.cloud.server_processes.wants_processor", lambda _pidfd: True)
         assert mesh.result(mesh.call("/plan"))["answered"] == 1
     server.send(signal.SIGSTOP)
     program = mesh.call("/plan", "--timeout-s", "30")

@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from protos.model.ids import ServiceName
-from sidecar.core.base.values import RejectReason
-from sidecar.ros.graph import graph
+from plr.protos.model.ids import ServiceName
+from plr.sidecar.core.base.values import RejectReason
+from plr.sidecar.ros.graph import graph
 from tests.ros.mesh import no_name, wait_until
 
 if TYPE_CHECKING:
@@ -37,7 +37,7 @@ def offered(mesh: Mesh) -> dict[str, str]:
 
 @pytest.mark.audit("dp-15")
 def test_a_stray_of_another_type_hides_no_death(mesh: Mesh, caplog: pytest.LogCaptureFixture) -> None:
-    caplog.set_level(logging.WARNING, "sidecar")
+    caplog.set_level(logging.WARNING, "plr.sidecar")
     mesh.start()
     server = mesh.serve("--plan", "/plan")
     mesh.wait_carried("/plan")

@@ -14,7 +14,7 @@ from tests.ros.mesh import POLL_S, wait_until
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from sidecar.ros.bridge import RosBridge
+    from plr.sidecar.ros.bridge import RosBridge
     from tests.ros.mesh import Mesh
     from tests.ros.processes import Program
 
@@ -101,7 +101,7 @@ def test_a_server_that_stood_still_is_offered_again(mesh: Mesh) -> None:
 @pytest.mark.usefixtures("short_lease")
 def test_a_sidecar_that_stood_still_is_no_application(mesh: Mesh, caplog: pytest.LogCaptureFixture) -> None:
     """Its proxy is not offered on, neither while nothing is known of it nor after."""
-    caplog.set_level(logging.INFO, "sidecar")
+    caplog.set_level(logging.INFO, "plr.sidecar")
     mesh.cloud.start(mesh.link.cloud)
 
     def start() -> Program:

@@ -13,8 +13,8 @@ from nav_msgs.srv import GetPlan
 from rclpy.serialization import deserialize_message, serialize_message
 from std_srvs.srv import SetBool
 
-from sidecar.ros.errors import RosBridgeError
-from sidecar.ros.types import TypeNotInstalledError, load_service_type
+from plr.sidecar.ros.errors import RosBridgeError
+from plr.sidecar.ros.types import TypeNotInstalledError, load_service_type
 from tests.ros.processes import ROOT
 
 pytestmark = pytest.mark.ros

@@ -89,6 +89,8 @@ class Fleet:
             before.send_signal(signal.SIGTERM)
             assert before.wait(PATIENCE_S) == 0, self.log(part)
         module = "controlplane" if part == "control" else "sidecar"
+        if (code / "plr").is_dir():  # Since the packages have a name that nobody else has.
+            module = f"plr.{module}"
         environment = {
             **os.environ,
             "PYTHONPATH": str(code),

@@ -7,8 +7,8 @@ import random
 from itertools import count
 from typing import TYPE_CHECKING
 
-from sidecar.core.path.congestion.controller import CongestionController, RateSample
-from sidecar.core.path.congestion.rtt import RttEstimator
+from plr.sidecar.core.path.congestion.controller import CongestionController, RateSample
+from plr.sidecar.core.path.congestion.rtt import RttEstimator
 
 if TYPE_CHECKING:
     from collections.abc import Callable

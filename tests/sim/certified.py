@@ -5,21 +5,21 @@ from __future__ import annotations
 import time
 from typing import TYPE_CHECKING
 
-from controlplane.ca import Authority
-from controlplane.ca.files import write_tls_files
-from protos.program.tls_files import load_tls_files
-from protos.trust.clock_floor import ClockFloor
-from protos.trust.identity import IdentityRole
-from sidecar.control.announcement import Announcer
-from sidecar.state.start_session import signed, start_session
+from plr.controlplane.ca import Authority
+from plr.controlplane.ca.files import write_tls_files
+from plr.protos.program.tls_files import load_tls_files
+from plr.protos.trust.clock_floor import ClockFloor
+from plr.protos.trust.identity import IdentityRole
+from plr.sidecar.control.announcement import Announcer
+from plr.sidecar.state.start_session import signed, start_session
 from tests.support.mesh import Mesh
 
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from protos.program.tls_files import TlsFiles
-    from protos.trust.credential import SessionCredential
-    from sidecar.core.crypto.session import OwnSession
+    from plr.protos.program.tls_files import TlsFiles
+    from plr.protos.trust.credential import SessionCredential
+    from plr.sidecar.core.crypto.session import OwnSession
     from tests.support.mesh import Node
 
 

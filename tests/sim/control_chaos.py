@@ -16,11 +16,11 @@ import random
 import zlib
 from typing import TYPE_CHECKING
 
-from controlplane.core.control.events import Settings
-from controlplane.core.publish.messages import CloseReason
-from protos.model.ids import InterfaceName, NodeName, Role, ServiceName, SessionId, Version
-from protos.model.mapping import MappingSet
-from protos.model.members import (
+from plr.controlplane.core.control.events import Settings
+from plr.controlplane.core.publish.messages import CloseReason
+from plr.protos.model.ids import InterfaceName, NodeName, Role, ServiceName, SessionId, Version
+from plr.protos.model.mapping import MappingSet
+from plr.protos.model.members import (
     AT_MOST_EVERY_INTERFACE,
     EVERY_INTERFACE,
     CandidateSet,
@@ -30,13 +30,13 @@ from protos.model.members import (
     ServiceSet,
     ServiceUse,
 )
-from protos.model.status import SyncState
+from plr.protos.model.status import SyncState
 from tests.support.control_world import SimSidecar, World
 from tests.support.samples import PLAN_TYPE, interfaces, offer, path, registration, use
 
 if TYPE_CHECKING:
-    from controlplane.core.policy.policy import Policy
-    from protos.model.members import Peer
+    from plr.controlplane.core.policy.policy import Policy
+    from plr.protos.model.members import Peer
 
 SERVICES = ("/plan", "/detect", "/grasp")
 NICS = ("wlan0", "wwan0", "eth0")

@@ -18,17 +18,17 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from bench.evaluation.scenario import Scenario, read_scenarios
-from controlplane.planning.fifo import FifoLink
 from lab.trace_folder import read_folder
-from protos.model.redundancy_mode import RedundancyMode
+from plr.controlplane.planning.fifo import FifoLink
+from plr.protos.model.redundancy_mode import RedundancyMode
 from tests.sim.test_mesh import mapped
 from tests.support.mesh import IPV6, Mesh, Node, rule
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from protos.model.ids import Address
-    from sidecar.core.rules.budget import Budget
+    from plr.protos.model.ids import Address
+    from plr.sidecar.core.rules.budget import Budget
 
 STARTING_S = 1.0
 WARM_S = 4.0

@@ -5,22 +5,22 @@ from __future__ import annotations
 import dataclasses
 from typing import TYPE_CHECKING
 
-from controlplane.core.control.control import ControlCore
-from controlplane.core.control.events import OffersRefusedNotice, Settings
-from controlplane.core.publish.messages import Send
-from controlplane.core.registry.registry import Refusal
-from controlplane.solver.matcher import solve
-from protos.convert import control_message_to_proto, parse_control_message
-from protos.model.ids import PROTOCOL_VERSION, Role
-from protos.model.mapping import MappingSet
-from protos.model.members import CandidateSet, PeerSet, Registration, ServiceSet
-from protos.model.stream import Ack, Heartbeat, ResourceKind, Welcome
+from plr.controlplane.core.control.control import ControlCore
+from plr.controlplane.core.control.events import OffersRefusedNotice, Settings
+from plr.controlplane.core.publish.messages import Send
+from plr.controlplane.core.registry.registry import Refusal
+from plr.controlplane.solver.matcher import solve
+from plr.protos.convert import control_message_to_proto, parse_control_message
+from plr.protos.model.ids import PROTOCOL_VERSION, Role
+from plr.protos.model.mapping import MappingSet
+from plr.protos.model.members import CandidateSet, PeerSet, Registration, ServiceSet
+from plr.protos.model.stream import Ack, Heartbeat, ResourceKind, Welcome
 
 if TYPE_CHECKING:
-    from controlplane.core.policy.policy import Policy
-    from controlplane.core.registry.registry import StreamId
-    from protos.model.ids import NodeName
-    from protos.model.stream import ControlMessage
+    from plr.controlplane.core.policy.policy import Policy
+    from plr.controlplane.core.registry.registry import StreamId
+    from plr.protos.model.ids import NodeName
+    from plr.protos.model.stream import ControlMessage
     from tests.support.mesh import Mesh, Node
 
 STEP_S = 0.02

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 from tests.support.mesh import IPV6, Mesh
 
 if TYPE_CHECKING:
-    from protos.model.ids import Address
+    from plr.protos.model.ids import Address
 
 FIRST_PORT = 10_000
 

@@ -6,9 +6,9 @@ from collections import deque
 from itertools import count
 from typing import TYPE_CHECKING
 
-from sidecar.core.base.values import ExecutionId, RejectReason, RequestId
-from sidecar.core.seam.application import AbandonExecution, ApplicationEvent, CancelExecution, ExecuteRequest
-from sidecar.ros.cloud.request_window import RequestWindow
+from plr.sidecar.core.base.values import ExecutionId, RejectReason, RequestId
+from plr.sidecar.core.seam.application import AbandonExecution, ApplicationEvent, CancelExecution, ExecuteRequest
+from plr.sidecar.ros.cloud.request_window import RequestWindow
 
 if TYPE_CHECKING:
     from tests.support.mesh import Mesh, Node

@@ -11,13 +11,13 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from controlplane.core.overload.admission import Admission
-from controlplane.core.overload.pacing import Pacing
-from controlplane.serve import tls_gate
-from protos.model.ids import PROTOCOL_VERSION, NodeName, Role, SessionId
-from protos.model.members import Registration
-from protos.model.stream import Welcome
-from sidecar.core.control.session import ControlSession, ControlState
+from plr.controlplane.core.overload.admission import Admission
+from plr.controlplane.core.overload.pacing import Pacing
+from plr.controlplane.serve import tls_gate
+from plr.protos.model.ids import PROTOCOL_VERSION, NodeName, Role, SessionId
+from plr.protos.model.members import Registration
+from plr.protos.model.stream import Welcome
+from plr.sidecar.core.control.session import ControlSession, ControlState
 
 if TYPE_CHECKING:
     from collections.abc import Callable

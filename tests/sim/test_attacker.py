@@ -7,14 +7,14 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import pytest
 
-from sidecar.core.wire import frame
+from plr.sidecar.core.wire import frame
 from tests.sim.test_mesh import assert_at_most_once, assert_each_answered_once
 from tests.sim.test_sealing import dropped, pair
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from protos.model.ids import Address
+    from plr.protos.model.ids import Address
     from tests.support.mesh import Mesh, Node
 
 ELSEWHERE: Address = ("attacker.eth0", 666)

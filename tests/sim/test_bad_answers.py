@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from sidecar.core.seam.application import DeadlineMissed, RequestFailed
+from plr.sidecar.core.seam.application import DeadlineMissed, RequestFailed
 from tests.support.mesh import Mesh, Node, rule
 
 GARBAGE = b"garbage"

@@ -6,15 +6,15 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from controlplane.cli.explanation_text import render
-from protos.model.ids import Role
-from sidecar.core.robot.dispatch.penalties import FIRST_S, LONGEST_S
+from plr.controlplane.cli.explanation_text import render
+from plr.protos.model.ids import Role
+from plr.sidecar.core.robot.dispatch.penalties import FIRST_S, LONGEST_S
 from tests.sim.joined_planes import JoinedPlanes
 from tests.support.mesh import SERVICE, Mesh, Node, rule
 
 if TYPE_CHECKING:
-    from protos.model.ids import NodeName
-    from protos.model.mapping import ServiceMapping
+    from plr.protos.model.ids import NodeName
+    from plr.protos.model.mapping import ServiceMapping
 
 pytestmark = pytest.mark.audit("sec-2")
 

@@ -7,7 +7,7 @@ from statistics import median
 
 import pytest
 
-from protos.model.ids import Role
+from plr.protos.model.ids import Role
 from tests.support.mesh import Mesh, Node, rule
 
 MBIT = 1e6 / 8

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import pytest
 
-from protos.model.ids import InterfaceName, NodeName
-from sidecar.core.base import request_id as identity
-from sidecar.core.base.request_id import OBSERVED_ONE_IN
-from sidecar.core.base.values import PathState
+from plr.protos.model.ids import InterfaceName, NodeName
+from plr.sidecar.core.base import request_id as identity
+from plr.sidecar.core.base.request_id import OBSERVED_ONE_IN
+from plr.sidecar.core.base.values import PathState
 from tests.sim.serial_server import SerialServer
 from tests.sim.test_mesh import assert_at_most_once, assert_each_answered_once, call_at, mapped, two_by_two
 from tests.support.mesh import SERVICE, Mesh, Node

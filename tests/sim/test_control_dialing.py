@@ -1,7 +1,7 @@
 """The policy of the control stream's dialer in simulated time: two carriers that go dark in turn, never both at once.
 
-The driver here does what `sidecar.net.control_dialer` does with sockets. A connection is a round trip long to make, two
-more to register; what is sent over a dark carrier is neither acknowledged nor refused.
+The driver here does what `plr.sidecar.net.control_dialer` does with sockets. A connection takes a round trip to
+make, two more to register; what is sent over a dark carrier is neither acknowledged nor refused.
 """
 
 from __future__ import annotations
@@ -14,11 +14,11 @@ from itertools import pairwise
 
 import pytest
 
-from protos.model.ids import Address, InterfaceName
-from sidecar.core.base.values import PathState
-from sidecar.core.control.race import ControlRace
-from sidecar.core.control.watch import CHEAPER, KEEPALIVE_S, SILENT, ControlWatch, Seen
-from sidecar.core.control.ways import WELL_S, ControlInterface, ControlWays, Price, Way
+from plr.protos.model.ids import Address, InterfaceName
+from plr.sidecar.core.base.values import PathState
+from plr.sidecar.core.control.race import ControlRace
+from plr.sidecar.core.control.watch import CHEAPER, KEEPALIVE_S, SILENT, ControlWatch, Seen
+from plr.sidecar.core.control.ways import WELL_S, ControlInterface, ControlWays, Price, Way
 
 STEP_S = 0.02
 WLAN, WWAN = InterfaceName("wlan0"), InterfaceName("wwan0")

@@ -8,17 +8,17 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from controlplane.core.control.events import Settings
-from controlplane.core.policy.policy import CallRule, OfferRule, Policy
-from controlplane.core.publish.messages import CloseReason
-from protos.model.ids import InterfaceName, Role, Version
-from protos.model.members import AT_MOST_EVERY_INTERFACE, CandidateSet, Copies, InterfaceLabel, PeerSet, ServiceSet
+from plr.controlplane.core.control.events import Settings
+from plr.controlplane.core.policy.policy import CallRule, OfferRule, Policy
+from plr.controlplane.core.publish.messages import CloseReason
+from plr.protos.model.ids import InterfaceName, Role, Version
+from plr.protos.model.members import AT_MOST_EVERY_INTERFACE, CandidateSet, Copies, InterfaceLabel, PeerSet, ServiceSet
 from tests.sim.control_chaos import Chaos
 from tests.support.control_world import SimSidecar, World
 from tests.support.samples import interfaces, offer, registration, use
 
 if TYPE_CHECKING:
-    from protos.model.mapping import MappingSet
+    from plr.protos.model.mapping import MappingSet
 
 
 @pytest.mark.parametrize("seed", range(12))

@@ -5,8 +5,8 @@ from __future__ import annotations
 import pytest
 
 from bench.evaluation.scenario import Scenario, read_scenarios
-from protos.model.redundancy_mode import RedundancyMode
-from sidecar.core.rules.budget import Budget
+from plr.protos.model.redundancy_mode import RedundancyMode
+from plr.sidecar.core.rules.budget import Budget
 from tests.sim.drives import drive
 
 

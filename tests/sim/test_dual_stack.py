@@ -6,11 +6,11 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from sidecar.core.wire.frame import BASE_BYTES
+from plr.sidecar.core.wire.frame import BASE_BYTES
 from tests.support.mesh import IPV6, Mesh, Node
 
 if TYPE_CHECKING:
-    from protos.model.ids import Address
+    from plr.protos.model.ids import Address
 
 
 def pair(delay_s: float = 0.01) -> tuple[Mesh, Node, Node]:

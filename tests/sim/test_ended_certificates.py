@@ -7,12 +7,12 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from protos.trust.identity import EXPIRED, CertificateError
-from sidecar.core.seam.links import SetCredential
+from plr.protos.trust.identity import EXPIRED, CertificateError
+from plr.sidecar.core.seam.links import SetCredential
 from tests.sim.test_sealing import pair
 
 if TYPE_CHECKING:
-    from protos.trust.credential import SessionCredential
+    from plr.protos.trust.credential import SessionCredential
     from tests.support.mesh import Mesh, Node
 
 pytestmark = pytest.mark.audit("sec-6")

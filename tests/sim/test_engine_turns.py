@@ -11,12 +11,12 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from protos.model.ids import InterfaceName, ServiceName, Version
-from protos.model.members import PeerSet, RemovalReason, RemovedPeer, ServiceOffer
-from protos.model.redundancy_mode import RedundancyMode
-from sidecar.core.engine.engine import Engine
-from sidecar.core.seam.application import RequestFailed
-from sidecar.core.seam.links import SetCarrier
+from plr.protos.model.ids import InterfaceName, ServiceName, Version
+from plr.protos.model.members import PeerSet, RemovalReason, RemovedPeer, ServiceOffer
+from plr.protos.model.redundancy_mode import RedundancyMode
+from plr.sidecar.core.engine.engine import Engine
+from plr.sidecar.core.seam.application import RequestFailed
+from plr.sidecar.core.seam.links import SetCarrier
 from tests.support.mesh import TYPE, Mesh, Node, rule
 
 if TYPE_CHECKING:

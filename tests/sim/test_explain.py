@@ -6,17 +6,17 @@ from dataclasses import replace
 
 import pytest
 
-from controlplane.cli.explanation_text import render
-from controlplane.core.control.events import Settings
-from controlplane.core.explain.explanation import UnknownNameError
-from controlplane.core.policy.path_rules import PathRule
-from controlplane.core.problem.problem import BlockKey
-from protos.model.explanation import AlternativeKind, Correlation, Explanation
-from protos.model.ids import InterfaceName, NodeName, Role, ServiceName
-from protos.model.mapping import Assignment
-from protos.model.members import AT_MOST_EVERY_INTERFACE, CandidateSet, InterfaceLabel, ServiceSet
-from protos.model.report import InterfaceJointReport, JointReport, Report
-from protos.model.status import SyncState
+from plr.controlplane.cli.explanation_text import render
+from plr.controlplane.core.control.events import Settings
+from plr.controlplane.core.explain.explanation import UnknownNameError
+from plr.controlplane.core.policy.path_rules import PathRule
+from plr.controlplane.core.problem.problem import BlockKey
+from plr.protos.model.explanation import AlternativeKind, Correlation, Explanation
+from plr.protos.model.ids import InterfaceName, NodeName, Role, ServiceName
+from plr.protos.model.mapping import Assignment
+from plr.protos.model.members import AT_MOST_EVERY_INTERFACE, CandidateSet, InterfaceLabel, ServiceSet
+from plr.protos.model.report import InterfaceJointReport, JointReport, Report
+from plr.protos.model.status import SyncState
 from tests.support.control_world import SimSidecar, World
 from tests.support.samples import PLAN, histogram, interfaces, latency, offer, path, registration, use
 

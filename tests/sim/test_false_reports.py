@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import pytest
 
-from controlplane.cli.explanation_text import render
-from controlplane.core.control.events import Settings
-from controlplane.core.policy.policy import CallRule, OfferRule, Policy
-from protos.base.histogram import MAX_COUNT, Histogram
-from protos.model.ids import InterfaceName, NodeName, Role, ServiceName
-from protos.model.mapping import Assignment
-from protos.model.members import CandidateSet, ServiceSet
-from protos.model.report import LatencyReport, Report
+from plr.controlplane.cli.explanation_text import render
+from plr.controlplane.core.control.events import Settings
+from plr.controlplane.core.policy.policy import CallRule, OfferRule, Policy
+from plr.protos.base.histogram import MAX_COUNT, Histogram
+from plr.protos.model.ids import InterfaceName, NodeName, Role, ServiceName
+from plr.protos.model.mapping import Assignment
+from plr.protos.model.members import CandidateSet, ServiceSet
+from plr.protos.model.report import LatencyReport, Report
 from tests.support.control_world import World
 from tests.support.samples import histogram, interfaces, latency, offer, registration, use
 

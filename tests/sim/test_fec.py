@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from protos.model.ids import Role
+from plr.protos.model.ids import Role
 from tests.support.mesh import Mesh, Node, rule
 
 if TYPE_CHECKING:

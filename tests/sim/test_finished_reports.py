@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from sidecar.core.link import sender
-from sidecar.core.seam.links import LinkCommand, SendFinished
+from plr.sidecar.core.link import sender
+from plr.sidecar.core.seam.links import LinkCommand, SendFinished
 from tests.support.mesh import Mesh, rule
 
 pytestmark = pytest.mark.audit("dp-8")

@@ -13,18 +13,18 @@ import pytest
 from bench.fleetday.day import Day, Scale
 from bench.fleetday.held import HeldPeers
 from bench.fleetday.sizes import Sizes, grown, measure
-from controlplane.core.formulation.problem_builder import Drawing
-from controlplane.core.publish.snapshots import Track
-from controlplane.core.publish.views import Views
-from controlplane.core.registry.registry import Registry
-from protos.model.status import SyncState
+from plr.controlplane.core.formulation.problem_builder import Drawing
+from plr.controlplane.core.publish.snapshots import Track
+from plr.controlplane.core.publish.views import Views
+from plr.controlplane.core.registry.registry import Registry
+from plr.protos.model.status import SyncState
 
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from controlplane.core.publish.snapshots import VersionSource
-    from protos.model.ids import Version
-    from protos.model.members import PeerSet
+    from plr.controlplane.core.publish.snapshots import VersionSource
+    from plr.protos.model.ids import Version
+    from plr.protos.model.members import PeerSet
 
 pytestmark = pytest.mark.audit("ops-24h")
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from protos.model.ids import InterfaceName
+from plr.protos.model.ids import InterfaceName
 from tests.sim.test_mesh import assert_at_most_once, assert_each_answered_once, call_at, mapped, two_by_two
 
 if TYPE_CHECKING:

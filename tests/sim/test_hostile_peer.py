@@ -12,10 +12,10 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from sidecar.core.link import sender
-from sidecar.core.message import reassembly
-from sidecar.core.wire import frame
-from sidecar.core.wire.frame import BASE_SYMBOL_BYTES, MAX_MESSAGE_BYTES, MIN_SYMBOL_BYTES
+from plr.sidecar.core.link import sender
+from plr.sidecar.core.message import reassembly
+from plr.sidecar.core.wire import frame
+from plr.sidecar.core.wire.frame import BASE_SYMBOL_BYTES, MAX_MESSAGE_BYTES, MIN_SYMBOL_BYTES
 from tests.fuzz.test_engine_fuzz import Rogue, arena, assert_bounded
 
 if TYPE_CHECKING:

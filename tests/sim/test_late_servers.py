@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import pytest
 
-from protos.model.members import ServiceOffer
-from protos.model.redundancy_mode import RedundancyMode
-from sidecar.core.base.values import RejectReason
-from sidecar.core.robot.request.service_catalog import WITHDRAW_AFTER_S
-from sidecar.core.seam.application import ApplicationEvent, ExecuteRequest, RequestFailed, WithdrawService
+from plr.protos.model.members import ServiceOffer
+from plr.protos.model.redundancy_mode import RedundancyMode
+from plr.sidecar.core.base.values import RejectReason
+from plr.sidecar.core.robot.request.service_catalog import WITHDRAW_AFTER_S
+from plr.sidecar.core.seam.application import ApplicationEvent, ExecuteRequest, RequestFailed, WithdrawService
 from tests.sim.test_mesh import call_at, mapped
 from tests.support.mesh import SERVICE, TYPE, Mesh, Node, rule
 

@@ -7,12 +7,12 @@ from collections import Counter
 
 import pytest
 
-from protos.model.ids import InterfaceName, NodeName, Version
-from protos.model.mapping import Assignment, MappingSet, ServiceMapping
-from protos.model.members import Peer, PeerSet
-from sidecar.core.path.path import DOWN_FLOOR_S
-from sidecar.core.path.probing import FIRST_PROBE_S
-from sidecar.core.seam.application import DeadlineMissed, OfferService, RequestFailed, WithdrawService
+from plr.protos.model.ids import InterfaceName, NodeName, Version
+from plr.protos.model.mapping import Assignment, MappingSet, ServiceMapping
+from plr.protos.model.members import Peer, PeerSet
+from plr.sidecar.core.path.path import DOWN_FLOOR_S
+from plr.sidecar.core.path.probing import FIRST_PROBE_S
+from plr.sidecar.core.seam.application import DeadlineMissed, OfferService, RequestFailed, WithdrawService
 from tests.support.mesh import SERVICE, Mesh, Node, rule
 
 

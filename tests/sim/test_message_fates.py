@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from sidecar.core.message.reassembly import MAX_AGE_S
-from sidecar.core.path.pmtu import HEADERS_V4
-from sidecar.core.wire.frame import BASE_BYTES
+from plr.sidecar.core.message.reassembly import MAX_AGE_S
+from plr.sidecar.core.path.pmtu import HEADERS_V4
+from plr.sidecar.core.wire.frame import BASE_BYTES
 from tests.sim.test_mesh import mapped, two_by_two
 from tests.support.mesh import Mesh, Node, rule
 

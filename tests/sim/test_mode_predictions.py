@@ -8,14 +8,14 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from protos.model.redundancy_mode import RedundancyMode
-from sidecar.core.rules.budget import Budget
+from plr.protos.model.redundancy_mode import RedundancyMode
+from plr.sidecar.core.rules.budget import Budget
 from tests.sim.joined_planes import JoinedPlanes
 from tests.sim.test_redundancy_modes import stall
 from tests.support.mesh import SERVICE, Mesh, Node, rule
 
 if TYPE_CHECKING:
-    from controlplane.core.explain.fleet_view import MissView
+    from plr.controlplane.core.explain.fleet_view import MissView
 
 pytestmark = pytest.mark.audit("ops-12")
 

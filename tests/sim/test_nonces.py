@@ -8,18 +8,18 @@ from typing import TYPE_CHECKING, Any
 import pytest
 from cryptography.hazmat.primitives.ciphers.aead import AESGCM, ChaCha20Poly1305
 
-from protos.model.ids import Version
-from protos.model.members import PeerSet
-from protos.trust.credential import Aead
-from sidecar.core.crypto import aead
-from sidecar.core.link.link import Link
-from sidecar.core.path.key_exchange import KeyLimits
-from sidecar.core.seam.links import ResetPaths, SetPeers, SetReady
-from sidecar.core.wire import introduction
+from plr.protos.model.ids import Version
+from plr.protos.model.members import PeerSet
+from plr.protos.trust.credential import Aead
+from plr.sidecar.core.crypto import aead
+from plr.sidecar.core.link.link import Link
+from plr.sidecar.core.path.key_exchange import KeyLimits
+from plr.sidecar.core.seam.links import ResetPaths, SetPeers, SetReady
+from plr.sidecar.core.wire import introduction
 from tests.support.mesh import Mesh, Node
 
 if TYPE_CHECKING:
-    from protos.model.ids import InterfaceName
+    from plr.protos.model.ids import InterfaceName
 
 WORLDS = 24
 LEAST_SEALS = 200

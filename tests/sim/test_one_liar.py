@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import pytest
 
-from controlplane.core.control.events import Settings
-from controlplane.core.policy.policy import CallRule, OfferRule, Policy
-from controlplane.observe.fleet_metrics import families
-from protos.model.ids import NodeName, Role
-from protos.model.members import RemovalReason, ServiceSet
-from protos.model.report import Report
+from plr.controlplane.core.control.events import Settings
+from plr.controlplane.core.policy.policy import CallRule, OfferRule, Policy
+from plr.controlplane.observe.fleet_metrics import families
+from plr.protos.model.ids import NodeName, Role
+from plr.protos.model.members import RemovalReason, ServiceSet
+from plr.protos.model.report import Report
 from tests.support.control_world import SETTLED_S, SimSidecar, World
 from tests.support.samples import PLAN, offer, path, registration
 from tests.support.scrapes import fleet_of, series, value

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import pytest
 
-from protos.model.ids import NodeName
-from sidecar.core.base.values import PathState
-from sidecar.core.path.probing import FIRST_PROBE_S
+from plr.protos.model.ids import NodeName
+from plr.sidecar.core.base.values import PathState
+from plr.sidecar.core.path.probing import FIRST_PROBE_S
 from tests.sim.test_mesh import mapped
 from tests.support.mesh import Mesh, rule
 

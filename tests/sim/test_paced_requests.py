@@ -7,12 +7,12 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import pytest
 
-from sidecar.core.path.send_queue import Turn
+from plr.sidecar.core.path.send_queue import Turn
 from tests.support.mesh import Mesh, Node, Wire, rule
 
 if TYPE_CHECKING:
-    from sidecar.core.base.values import ExecutionId, RequestId
-    from sidecar.core.path.congestion.controller import CongestionController
+    from plr.sidecar.core.base.values import ExecutionId, RequestId
+    from plr.sidecar.core.path.congestion.controller import CongestionController
 
 MBIT = 1e6 / 8
 HZ = 10

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from protos.model.ids import Role
-from protos.model.redundancy_mode import RedundancyMode
+from plr.protos.model.ids import Role
+from plr.protos.model.redundancy_mode import RedundancyMode
 from tests.sim.serial_server import SerialServer
 from tests.support.mesh import Mesh, rule
 

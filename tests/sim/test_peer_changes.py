@@ -12,26 +12,26 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from controlplane.core.control.control import ControlCore
-from controlplane.core.control.events import Settings
-from controlplane.core.policy.policy import CallRule, OfferRule, Policy
-from controlplane.core.publish.messages import Close, Send
-from controlplane.core.publish.publisher import RESEND_S
-from controlplane.core.registry.registry import Refusal, StreamId
-from controlplane.serve import stream_encoder
-from controlplane.serve.stream_encoder import StreamEncoder
-from protos.convert import parse_control_message
-from protos.model.ids import NodeName, Role, ServiceName
-from protos.model.members import CandidateSet, PeerSet, Registration, ServiceSet
-from protos.model.peer_changes import put_together
-from protos.model.status import SyncState
-from protos.model.stream import Drain, ResourceKind, Welcome
-from sidecar.core.control.session import Apply, ControlSession, ControlState
+from plr.controlplane.core.control.control import ControlCore
+from plr.controlplane.core.control.events import Settings
+from plr.controlplane.core.policy.policy import CallRule, OfferRule, Policy
+from plr.controlplane.core.publish.messages import Close, Send
+from plr.controlplane.core.publish.publisher import RESEND_S
+from plr.controlplane.core.registry.registry import Refusal, StreamId
+from plr.controlplane.serve import stream_encoder
+from plr.controlplane.serve.stream_encoder import StreamEncoder
+from plr.protos.convert import parse_control_message
+from plr.protos.model.ids import NodeName, Role, ServiceName
+from plr.protos.model.members import CandidateSet, PeerSet, Registration, ServiceSet
+from plr.protos.model.peer_changes import put_together
+from plr.protos.model.status import SyncState
+from plr.protos.model.stream import Drain, ResourceKind, Welcome
+from plr.sidecar.core.control.session import Apply, ControlSession, ControlState
 from tests.support.samples import candidate, offer, registration, use
 
 if TYPE_CHECKING:
-    from controlplane.core.control.events import Event
-    from protos.model.stream import ControlMessage
+    from plr.controlplane.core.control.events import Event
+    from plr.protos.model.stream import ControlMessage
 
 STEPS = 300
 PLAN = ServiceName("/plan")

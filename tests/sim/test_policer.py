@@ -12,8 +12,8 @@ from tests.support.mesh import Mesh, rule
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from protos.model.ids import Address
-    from sidecar.core.base.values import ExecutionId
+    from plr.protos.model.ids import Address
+    from plr.sidecar.core.base.values import ExecutionId
 
 MBIT = 1e6 / 8
 REQUEST_BYTES = 180_000

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from protos.model.ids import ServiceName
-from protos.model.members import ServiceOffer
-from sidecar.core.base.values import Priority
+from plr.protos.model.ids import ServiceName
+from plr.protos.model.members import ServiceOffer
+from plr.sidecar.core.base.values import Priority
 from tests.sim.test_mesh import assert_each_answered_once
 from tests.support.mesh import SERVICE, TYPE, Mesh, rule
 

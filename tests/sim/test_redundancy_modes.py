@@ -8,10 +8,10 @@ from dataclasses import dataclass
 
 import pytest
 
-from controlplane.core.estimate.estimator import Estimator
-from protos.model.ids import InterfaceName
-from protos.model.redundancy_mode import RedundancyMode
-from sidecar.core.rules.budget import Budget
+from plr.controlplane.core.estimate.estimator import Estimator
+from plr.protos.model.ids import InterfaceName
+from plr.protos.model.redundancy_mode import RedundancyMode
+from plr.sidecar.core.rules.budget import Budget
 from tests.sim.test_mesh import assert_at_most_once, assert_each_answered_once, call_at, mapped
 from tests.support.mesh import SERVICE, Mesh, Node, Wire, rule
 

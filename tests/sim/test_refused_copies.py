@@ -6,9 +6,9 @@ from functools import partial
 
 import pytest
 
-from sidecar.core.base.values import RejectReason
-from sidecar.core.robot.dispatch.dispatcher import MAX_ASKED, MAX_COPIES
-from sidecar.core.seam.application import ApplicationEvent, ExecuteRequest, RequestFailed
+from plr.sidecar.core.base.values import RejectReason
+from plr.sidecar.core.robot.dispatch.dispatcher import MAX_ASKED, MAX_COPIES
+from plr.sidecar.core.seam.application import ApplicationEvent, ExecuteRequest, RequestFailed
 from tests.support.mesh import Mesh, rule
 
 

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import pytest
 
-from protos.model.ids import Role, ServiceName
-from protos.model.members import ServiceOffer
-from protos.model.redundancy_mode import RedundancyMode
-from sidecar.core.base.values import Priority
-from sidecar.core.transfer import room as room_module
-from sidecar.core.transfer.room import SMALL_BYTES, Lane
+from plr.protos.model.ids import Role, ServiceName
+from plr.protos.model.members import ServiceOffer
+from plr.protos.model.redundancy_mode import RedundancyMode
+from plr.sidecar.core.base.values import Priority
+from plr.sidecar.core.transfer import room as room_module
+from plr.sidecar.core.transfer.room import SMALL_BYTES, Lane
 from tests.support.mesh import TYPE, Mesh, rule
 
 SIZE = 400_000

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from sidecar.core.seam.application import RequestFailed
-from sidecar.core.transfer.room import Lane
+from plr.sidecar.core.seam.application import RequestFailed
+from plr.sidecar.core.transfer.room import Lane
 from tests.support.mesh import SERVICE, Mesh, Node, rule
 
 pytestmark = pytest.mark.audit("dp-7")
@@ -54,7 +54,7 @@ def test_when_their_cloud_restarts() -> None:
 def test_also_when_the_others_have_no_room_for_all_of_them(monkeypatch: pytest.MonkeyPatch) -> None:
     mesh, robot, near, far, unsent = backlog()
     ran_before = near.executed
-    monkeypatch.setattr("sidecar.core.transfer.room._ROOM_BYTES", dict.fromkeys(Lane, 150_000))
+    monkeypatch.setattr("plr.sidecar.core.transfer.room._ROOM_BYTES", dict.fromkeys(Lane, 150_000))
     near.start()
     mesh.push_views()
     mesh.run(0.001)

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import pytest
 
-from controlplane.core.control.events import Settings
-from controlplane.core.registry.registry import Refusal
-from controlplane.core.registry.restlessness import BYTES_BURST, BYTES_PER_S
-from protos.model.ids import NodeName, Role
-from protos.model.members import CandidateSet, PeerSet, ServiceSet
-from protos.model.stream import Drain
+from plr.controlplane.core.control.events import Settings
+from plr.controlplane.core.registry.registry import Refusal
+from plr.controlplane.core.registry.restlessness import BYTES_BURST, BYTES_PER_S
+from plr.protos.model.ids import NodeName, Role
+from plr.protos.model.members import CandidateSet, PeerSet, ServiceSet
+from plr.protos.model.stream import Drain
 from tests.support.control_world import SimSidecar, World
 from tests.support.samples import candidate, interfaces, offer, registration
 

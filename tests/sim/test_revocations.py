@@ -8,26 +8,26 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from controlplane.ca.authority import Authority
-from controlplane.ca.files import write_atomically, write_tls_files
-from protos.model.ids import Role
-from protos.program.tls_files import CRL_FILE, TlsWatch, load_tls_files
-from protos.trust.identity import IdentityRole
-from sidecar.control.announcement import Announcer
-from sidecar.control.revocations import Revocations
-from sidecar.core.base.values import Priority
-from sidecar.core.engine.revocation_exchange import ASK_NEXT_AFTER_S, MAX_SENDING_BYTES
-from sidecar.core.seam.links import SetCredential
-from sidecar.core.wire.messages import RevocationLists, RevocationsHeld, RevocationsWanted, encode_message
+from plr.controlplane.ca.authority import Authority
+from plr.controlplane.ca.files import write_atomically, write_tls_files
+from plr.protos.model.ids import Role
+from plr.protos.program.tls_files import CRL_FILE, TlsWatch, load_tls_files
+from plr.protos.trust.identity import IdentityRole
+from plr.sidecar.control.announcement import Announcer
+from plr.sidecar.control.revocations import Revocations
+from plr.sidecar.core.base.values import Priority
+from plr.sidecar.core.engine.revocation_exchange import ASK_NEXT_AFTER_S, MAX_SENDING_BYTES
+from plr.sidecar.core.seam.links import SetCredential
+from plr.sidecar.core.wire.messages import RevocationLists, RevocationsHeld, RevocationsWanted, encode_message
 from tests.support.mesh import Mesh, rule
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
     from pathlib import Path
 
-    from protos.model.ids import NodeName
-    from protos.trust.credential import SessionCredential
-    from sidecar.core.wire.messages import RevocationMessage
+    from plr.protos.model.ids import NodeName
+    from plr.protos.trust.credential import SessionCredential
+    from plr.sidecar.core.wire.messages import RevocationMessage
     from tests.support.mesh import Node
 
 pytestmark = pytest.mark.audit("sec-12")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from sidecar.core.seam.application import RequestFailed
+from plr.sidecar.core.seam.application import RequestFailed
 from tests.sim.nat import NatMesh
 from tests.sim.test_mesh import mapped
 from tests.support.mesh import rule

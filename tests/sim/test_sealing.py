@@ -8,19 +8,19 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from protos.base.errors import DecodeError
-from protos.model.ids import InterfaceId, Version
-from protos.model.members import PeerSet
-from protos.trust.credential import Aead
-from sidecar.core.path.key_exchange import KeyLimits
-from sidecar.core.wire import frame
-from sidecar.core.wire.introduction import encode_introduction
+from plr.protos.base.errors import DecodeError
+from plr.protos.model.ids import InterfaceId, Version
+from plr.protos.model.members import PeerSet
+from plr.protos.trust.credential import Aead
+from plr.sidecar.core.path.key_exchange import KeyLimits
+from plr.sidecar.core.wire import frame
+from plr.sidecar.core.wire.introduction import encode_introduction
 from tests.sim.test_mesh import assert_each_answered_once
 from tests.support.mesh import Mesh, Node
 from tests.support.sessions import credential_of
 
 if TYPE_CHECKING:
-    from protos.trust.credential import SessionCredential
+    from plr.protos.trust.credential import SessionCredential
 
 
 def pair(seed: int = 1, limits: KeyLimits | None = None) -> tuple[Mesh, Node, Node]:

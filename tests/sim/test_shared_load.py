@@ -6,12 +6,12 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from protos.model.ids import InterfaceName, NodeName, Version
-from protos.model.mapping import Assignment, MappingSet, ServiceMapping
+from plr.protos.model.ids import InterfaceName, NodeName, Version
+from plr.protos.model.mapping import Assignment, MappingSet, ServiceMapping
 from tests.support.mesh import SERVICE, Mesh, Node, rule
 
 if TYPE_CHECKING:
-    from sidecar.core.base.values import ExecutionId
+    from plr.sidecar.core.base.values import ExecutionId
 
 HZ = 5
 SIZE = 120_000

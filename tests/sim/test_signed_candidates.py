@@ -7,17 +7,17 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from protos.model.ids import InterfaceId, InterfaceName, Version
-from protos.model.members import Candidate, CandidateKind, PeerSet
-from protos.trust.candidate_signature import sign_candidates
+from plr.protos.model.ids import InterfaceId, InterfaceName, Version
+from plr.protos.model.members import Candidate, CandidateKind, PeerSet
+from plr.protos.trust.candidate_signature import sign_candidates
 from tests.sim.certified import CertifiedMesh
 
 if TYPE_CHECKING:
     from collections.abc import Callable
     from pathlib import Path
 
-    from protos.model.ids import Address
-    from protos.model.members import Peer
+    from plr.protos.model.ids import Address
+    from plr.protos.model.members import Peer
     from tests.support.mesh import Mesh, Node
 
 pytestmark = pytest.mark.audit("sec-5")

@@ -6,13 +6,13 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from sidecar.core.base.values import PathState
-from sidecar.core.path.probing import MAX_PROBE_S
+from plr.sidecar.core.base.values import PathState
+from plr.sidecar.core.path.probing import MAX_PROBE_S
 from tests.sim.test_mesh import assert_at_most_once, assert_each_answered_once
 from tests.support.mesh import Mesh, Node, Wire, rule
 
 if TYPE_CHECKING:
-    from sidecar.core.path.path import Path
+    from plr.sidecar.core.path.path import Path
 
 pytestmark = pytest.mark.audit("dp-2")
 

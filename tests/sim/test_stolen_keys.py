@@ -14,10 +14,10 @@ import pytest
 from cryptography.exceptions import InvalidTag
 from cryptography.hazmat.primitives.asymmetric.x25519 import X25519PrivateKey, X25519PublicKey
 
-from sidecar.core.base.values import PathState
-from sidecar.core.crypto.aead import KEY_BYTES, TAG_BYTES, make_cipher
-from sidecar.core.path.key_exchange import KeyLimits
-from sidecar.core.wire.frame import CLEAR, HEADER_BYTES, INTRODUCTION_FLAG, NONCE_OFFSET, decode_header
+from plr.sidecar.core.base.values import PathState
+from plr.sidecar.core.crypto.aead import KEY_BYTES, TAG_BYTES, make_cipher
+from plr.sidecar.core.path.key_exchange import KeyLimits
+from plr.sidecar.core.wire.frame import CLEAR, HEADER_BYTES, INTRODUCTION_FLAG, NONCE_OFFSET, decode_header
 from tests.sim.test_mesh import assert_each_answered_once
 from tests.sim.test_sealing import dropped, phases
 from tests.support.mesh import Mesh, Node
@@ -26,10 +26,10 @@ from tests.support.sessions import private_key
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from protos.model.ids import Address
-    from protos.model.members import Peer
-    from protos.trust.credential import Aead
-    from sidecar.core.crypto.key_schedule import PairKeys
+    from plr.protos.model.ids import Address
+    from plr.protos.model.members import Peer
+    from plr.protos.trust.credential import Aead
+    from plr.sidecar.core.crypto.key_schedule import PairKeys
 
 pytestmark = pytest.mark.audit("sec-9")
 

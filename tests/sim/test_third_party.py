@@ -10,20 +10,20 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from protos.model.ids import InterfaceId, InterfaceName, Role
-from protos.model.members import Candidate, CandidateKind
-from sidecar.core.base.request_id import make_request_id
-from sidecar.core.base.values import PathState, Priority
-from sidecar.core.link.path_table import UNPROVEN_BYTES, UNPROVEN_BYTES_PER_S
-from sidecar.core.path.address import AMPLIFICATION
-from sidecar.core.wire import frame
-from sidecar.core.wire.messages import RequestMessage, encode_message
+from plr.protos.model.ids import InterfaceId, InterfaceName, Role
+from plr.protos.model.members import Candidate, CandidateKind
+from plr.sidecar.core.base.request_id import make_request_id
+from plr.sidecar.core.base.values import PathState, Priority
+from plr.sidecar.core.link.path_table import UNPROVEN_BYTES, UNPROVEN_BYTES_PER_S
+from plr.sidecar.core.path.address import AMPLIFICATION
+from plr.sidecar.core.wire import frame
+from plr.sidecar.core.wire.messages import RequestMessage, encode_message
 from tests.support.mesh import SERVICE, TYPE, Mesh, rule
 
 if TYPE_CHECKING:
-    from protos.model.ids import Address
-    from protos.model.members import Peer
-    from sidecar.core.path.path import Path
+    from plr.protos.model.ids import Address
+    from plr.protos.model.members import Peer
+    from plr.sidecar.core.path.path import Path
     from tests.support.mesh import Node
 
 pytestmark = pytest.mark.audit("sec-5")

@@ -6,17 +6,17 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from protos.model.ids import Role
-from sidecar.core.base.values import Priority
-from sidecar.core.path.pmtu import HEADERS_V4
-from sidecar.core.seam.application import ExecuteRequest
-from sidecar.core.wire.frame import BASE_BYTES
+from plr.protos.model.ids import Role
+from plr.sidecar.core.base.values import Priority
+from plr.sidecar.core.path.pmtu import HEADERS_V4
+from plr.sidecar.core.seam.application import ExecuteRequest
+from plr.sidecar.core.wire.frame import BASE_BYTES
 from tests.sim.serial_server import SerialServer
 from tests.support.mesh import Mesh, Node, Wire, rule
 
 if TYPE_CHECKING:
-    from sidecar.core.message.repair import Redundancy
-    from sidecar.core.seam.application import ApplicationEvent
+    from plr.sidecar.core.message.repair import Redundancy
+    from plr.sidecar.core.seam.application import ApplicationEvent
 
 MBIT = 1e6 / 8
 DEADLINE_S, LIFETIME_S = 0.5, 10.0

@@ -6,17 +6,17 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from controlplane.cli.status_table import render
-from controlplane.core.control.events import UnmetNotice
-from controlplane.core.explain.explanation import UnknownNameError
-from controlplane.core.policy.policy import CallRule, OfferRule, Policy
-from protos.model.ids import NodeName, ServiceName
-from protos.model.members import ServiceSet
+from plr.controlplane.cli.status_table import render
+from plr.controlplane.core.control.events import UnmetNotice
+from plr.controlplane.core.explain.explanation import UnknownNameError
+from plr.controlplane.core.policy.policy import CallRule, OfferRule, Policy
+from plr.protos.model.ids import NodeName, ServiceName
+from plr.protos.model.members import ServiceSet
 from tests.support.control_world import SETTLED_S, World
 from tests.support.samples import offer, use
 
 if TYPE_CHECKING:
-    from controlplane.core.control.events import Event
+    from plr.controlplane.core.control.events import Event
 
 pytestmark = pytest.mark.audit("ops-5")
 

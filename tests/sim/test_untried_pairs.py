@@ -8,11 +8,11 @@ from dataclasses import dataclass, field
 import pytest
 from scipy.stats import beta
 
-from controlplane.core.estimate.estimator import Estimator
-from protos.base.histogram import Histogram
-from protos.base.size_class import size_class
-from protos.model.ids import InterfaceName, NodeName, ServiceName
-from protos.model.report import LatencyReport, PathReport, Report
+from plr.controlplane.core.estimate.estimator import Estimator
+from plr.protos.base.histogram import Histogram
+from plr.protos.base.size_class import size_class
+from plr.protos.model.ids import InterfaceName, NodeName, ServiceName
+from plr.protos.model.report import LatencyReport, PathReport, Report
 
 ROBOT, OTHER_ROBOT = NodeName("robot"), NodeName("other")
 DETECT, SEGMENT = ServiceName("/detect"), ServiceName("/segment")

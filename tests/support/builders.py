@@ -6,21 +6,21 @@ import random
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
-from protos.model.ids import Address, InterfaceId, InterfaceName, NodeName, Role, ServiceName, SessionId
-from protos.model.members import ALL_CALLS, Candidate, CandidateKind, Peer, ServiceOffer
-from protos.trust.pair_token import pair_token
-from sidecar.core.base.values import PathId, Priority, RequestId
-from sidecar.core.crypto.aead import TAG_BYTES
-from sidecar.core.link.link import Link
-from sidecar.core.link.memory import LinkMemory
-from sidecar.core.link.sender import LinkIdentity
-from sidecar.core.message.outbound import OutboundMessage
-from sidecar.core.path.key_exchange import DEFAULT_LIMITS
-from sidecar.core.path.keys import PathKeys, make_path_keys
-from sidecar.core.path.pmtu import HEADERS_V4
-from sidecar.core.rules.service_rule import ServiceRule
-from sidecar.core.seam.links import LinkCommand, LinkEvent, LinkPeer, SetMtu, SetPeers, SetReady
-from sidecar.core.wire.frame import (
+from plr.protos.model.ids import Address, InterfaceId, InterfaceName, NodeName, Role, ServiceName, SessionId
+from plr.protos.model.members import ALL_CALLS, Candidate, CandidateKind, Peer, ServiceOffer
+from plr.protos.trust.pair_token import pair_token
+from plr.sidecar.core.base.values import PathId, Priority, RequestId
+from plr.sidecar.core.crypto.aead import TAG_BYTES
+from plr.sidecar.core.link.link import Link
+from plr.sidecar.core.link.memory import LinkMemory
+from plr.sidecar.core.link.sender import LinkIdentity
+from plr.sidecar.core.message.outbound import OutboundMessage
+from plr.sidecar.core.path.key_exchange import DEFAULT_LIMITS
+from plr.sidecar.core.path.keys import PathKeys, make_path_keys
+from plr.sidecar.core.path.pmtu import HEADERS_V4
+from plr.sidecar.core.rules.service_rule import ServiceRule
+from plr.sidecar.core.seam.links import LinkCommand, LinkEvent, LinkPeer, SetMtu, SetPeers, SetReady
+from plr.sidecar.core.wire.frame import (
     BASE_BYTES,
     HEADER_BYTES,
     INTRODUCTION_FLAG,
@@ -30,8 +30,8 @@ from sidecar.core.wire.frame import (
     decode_frames,
     decode_header,
 )
-from sidecar.core.wire.introduction import Introduction, encode_introduction, open_introduction
-from sidecar.core.wire.messages import Encoded, RequestMessage
+from plr.sidecar.core.wire.introduction import Introduction, encode_introduction, open_introduction
+from plr.sidecar.core.wire.messages import Encoded, RequestMessage
 from tests.support.sessions import agree, credential_of, seal, session_of, with_credential
 
 if TYPE_CHECKING:

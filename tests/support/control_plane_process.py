@@ -15,14 +15,14 @@ from typing import TYPE_CHECKING, Any, Self, TypeVar
 import grpc
 import yaml
 
-from protos.convert import control_message_from_proto, sidecar_message_to_proto, status_from_proto
-from protos.model.ids import Role, Version
-from protos.model.mapping import MappingSet
-from protos.model.members import CandidateSet, PeerSet, Registration, ServiceSet
-from protos.model.stream import Ack, ControlMessage, Drain, Heartbeat, Nack, ResourceKind, SidecarMessage
-from protos.plr.v1 import admin_pb2, admin_pb2_grpc, control_pb2, control_pb2_grpc
-from protos.trust.credential import Aead, SessionCredential, session_number
-from protos.trust.identity import CONTROL_PLANE_DNS
+from plr.protos.convert import control_message_from_proto, sidecar_message_to_proto, status_from_proto
+from plr.protos.model.ids import Role, Version
+from plr.protos.model.mapping import MappingSet
+from plr.protos.model.members import CandidateSet, PeerSet, Registration, ServiceSet
+from plr.protos.model.stream import Ack, ControlMessage, Drain, Heartbeat, Nack, ResourceKind, SidecarMessage
+from plr.protos.plr.v1 import admin_pb2, admin_pb2_grpc, control_pb2, control_pb2_grpc
+from plr.protos.trust.credential import Aead, SessionCredential, session_number
+from plr.protos.trust.identity import CONTROL_PLANE_DNS
 from tests.support.samples import interfaces, offer, registration, use
 
 if TYPE_CHECKING:
@@ -31,8 +31,8 @@ if TYPE_CHECKING:
 
     from cryptography.hazmat.primitives.asymmetric.ec import EllipticCurvePrivateKey
 
-    from controlplane.ca import Issued
-    from protos.model.status import SidecarStatus, SyncState
+    from plr.controlplane.ca import Issued
+    from plr.protos.model.status import SidecarStatus, SyncState
 
 Message = TypeVar("Message", bound=ControlMessage)
 
@@ -45,7 +45,7 @@ _LISTENS = re.compile(r"listens: gRPC (\S+), STUN (.+), metrics (\S+)$")
 
 
 class ControlPlaneProcess:
-    """`python -m controlplane` on free ports of loopback; insecure unless told a `tls_dir`."""
+    """`python -m plr.controlplane` on free ports of loopback; insecure unless told a `tls_dir`."""
 
     def __init__(self, folder: Path, **changes: Any) -> None:
         self.settings = {
@@ -63,7 +63,7 @@ class ControlPlaneProcess:
         self.config.write_text(yaml.safe_dump(self.settings))
         self.lines: list[str] = []
         self._process = subprocess.Popen(
-            [sys.executable, "-m", "controlplane", "--config", str(self.config)],
+            [sys.executable, "-m", "plr.controlplane", "--config", str(self.config)],
             stderr=subprocess.PIPE,
             text=True,
         )

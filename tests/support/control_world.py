@@ -5,16 +5,16 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
-from controlplane.core.control.control import ControlCore
-from controlplane.core.control.events import DepartureNotice, NackNotice, Settings
-from controlplane.core.publish.messages import Close, CloseReason, Send
-from controlplane.core.registry.registry import Refusal, StreamId
-from controlplane.solver.matcher import solve
-from protos.model.ids import NodeName, Role, Version
-from protos.model.mapping import MappingSet, ServiceMapping
-from protos.model.members import CandidateSet, Peer, PeerSet, Registration, RemovalReason, ServiceSet
-from protos.model.report import PathReport, Report
-from protos.model.stream import Ack, ControlMessage, Drain, Heartbeat, Nack, ResourceKind, SidecarMessage, Welcome
+from plr.controlplane.core.control.control import ControlCore
+from plr.controlplane.core.control.events import DepartureNotice, NackNotice, Settings
+from plr.controlplane.core.publish.messages import Close, CloseReason, Send
+from plr.controlplane.core.registry.registry import Refusal, StreamId
+from plr.controlplane.solver.matcher import solve
+from plr.protos.model.ids import NodeName, Role, Version
+from plr.protos.model.mapping import MappingSet, ServiceMapping
+from plr.protos.model.members import CandidateSet, Peer, PeerSet, Registration, RemovalReason, ServiceSet
+from plr.protos.model.report import PathReport, Report
+from plr.protos.model.stream import Ack, ControlMessage, Drain, Heartbeat, Nack, ResourceKind, SidecarMessage, Welcome
 from tests.support.samples import interfaces, offer, path, registration, use
 
 if TYPE_CHECKING:

@@ -13,7 +13,7 @@ from cryptography.hazmat.primitives.serialization import Encoding
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
 if TYPE_CHECKING:
-    from controlplane.ca import Authority
+    from plr.controlplane.ca import Authority
 
 NOW = 1_900_000_000.0
 DAY_S = 86_400.0

@@ -8,30 +8,30 @@ from dataclasses import dataclass, field, replace
 from itertools import count
 from typing import TYPE_CHECKING
 
-from protos.model.ids import InterfaceId, InterfaceName, NodeName, Role, ServiceName, SessionId, Version
-from protos.model.members import ALL_CALLS, Candidate, CandidateKind, Peer, PeerSet, ServiceOffer
-from protos.trust.credential import Aead
-from protos.trust.pair_token import pair_token
-from sidecar.control.announcement import Announcer
-from sidecar.core.base.request_id import make_request_id
-from sidecar.core.base.values import RequestId
-from sidecar.core.engine.engine import Engine, EngineConfig
-from sidecar.core.link.link import Link
-from sidecar.core.link.sender import LinkIdentity
-from sidecar.core.path.key_exchange import DEFAULT_LIMITS
-from sidecar.core.path.pmtu import HEADERS_V4
-from sidecar.core.rules.service_rule import ServiceRule
-from sidecar.core.seam.application import ApplicationEvent, ExecuteRequest, ResponseArrived
-from sidecar.core.seam.links import SetReady
+from plr.protos.model.ids import InterfaceId, InterfaceName, NodeName, Role, ServiceName, SessionId, Version
+from plr.protos.model.members import ALL_CALLS, Candidate, CandidateKind, Peer, PeerSet, ServiceOffer
+from plr.protos.trust.credential import Aead
+from plr.protos.trust.pair_token import pair_token
+from plr.sidecar.control.announcement import Announcer
+from plr.sidecar.core.base.request_id import make_request_id
+from plr.sidecar.core.base.values import RequestId
+from plr.sidecar.core.engine.engine import Engine, EngineConfig
+from plr.sidecar.core.link.link import Link
+from plr.sidecar.core.link.sender import LinkIdentity
+from plr.sidecar.core.path.key_exchange import DEFAULT_LIMITS
+from plr.sidecar.core.path.pmtu import HEADERS_V4
+from plr.sidecar.core.rules.service_rule import ServiceRule
+from plr.sidecar.core.seam.application import ApplicationEvent, ExecuteRequest, ResponseArrived
+from plr.sidecar.core.seam.links import SetReady
 from tests.support.sessions import session_of
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from protos.model.ids import Address
-    from protos.model.mapping import MappingSet
-    from sidecar.core.crypto.session import OwnSession
-    from sidecar.core.rules.budget import Budget
+    from plr.protos.model.ids import Address
+    from plr.protos.model.mapping import MappingSet
+    from plr.sidecar.core.crypto.session import OwnSession
+    from plr.sidecar.core.rules.budget import Budget
 
 SERVICE = ServiceName("/echo")
 IPV6 = ":6"

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 from lab.attacker import registration as attacker
 
 if TYPE_CHECKING:
-    from controlplane.ca import Issued
-    from protos.model.ids import Role
+    from plr.controlplane.ca import Issued
+    from plr.protos.model.ids import Role
 
 
 def registration(issued: Issued, name: str, role: Role, incarnation: int | None = None) -> bytes:

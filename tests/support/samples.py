@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import zlib
 
-from controlplane.core.registry.registry import StreamId
-from protos.base.histogram import Histogram
-from protos.model.ids import (
+from plr.controlplane.core.registry.registry import StreamId
+from plr.protos.base.histogram import Histogram
+from plr.protos.model.ids import (
     PROTOCOL_VERSION,
     InterfaceId,
     InterfaceName,
@@ -16,7 +16,7 @@ from protos.model.ids import (
     SessionId,
     Version,
 )
-from protos.model.members import (
+from plr.protos.model.members import (
     EVERY_INTERFACE,
     Candidate,
     CandidateKind,
@@ -25,7 +25,7 @@ from protos.model.members import (
     ServiceOffer,
     ServiceUse,
 )
-from protos.model.report import LatencyReport, PathReport
+from plr.protos.model.report import LatencyReport, PathReport
 
 PLAN = ServiceName("/plan")
 PLAN_TYPE = "nav_msgs/srv/GetPlan"

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from controlplane.observe.fleet_metrics import MAX_GONE, Fleet
-from protos.model.ids import NodeName
+from plr.controlplane.observe.fleet_metrics import MAX_GONE, Fleet
+from plr.protos.model.ids import NodeName
 
 if TYPE_CHECKING:
     from collections.abc import Iterable

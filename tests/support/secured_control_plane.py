@@ -8,15 +8,15 @@ import time
 import urllib.request
 from typing import TYPE_CHECKING, Any
 
-from controlplane.ca import Authority
-from protos.trust.identity import IdentityRole
+from plr.controlplane.ca import Authority
+from plr.protos.trust.identity import IdentityRole
 from tests.support.control_plane_process import PATIENCE_S, ControlPlaneProcess, Secured
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
     from pathlib import Path
 
-    from controlplane.ca import Validity
+    from plr.controlplane.ca import Validity
 
 
 HOUR_S = 3600.0

@@ -8,17 +8,17 @@ from dataclasses import replace
 from functools import lru_cache
 from typing import TYPE_CHECKING
 
-from protos.model.ids import NodeName, Role, SessionId
-from protos.trust.credential import Aead, SessionCredential
-from sidecar.core.crypto.aead import NONCE_BYTES, TAG_BYTES
-from sidecar.core.crypto.session import OwnSession, public_key
-from sidecar.core.wire.frame import HEADER_BYTES, PHASE_FLAG, Header, encode_header
+from plr.protos.model.ids import NodeName, Role, SessionId
+from plr.protos.trust.credential import Aead, SessionCredential
+from plr.sidecar.core.crypto.aead import NONCE_BYTES, TAG_BYTES
+from plr.sidecar.core.crypto.session import OwnSession, public_key
+from plr.sidecar.core.wire.frame import HEADER_BYTES, PHASE_FLAG, Header, encode_header
 
 if TYPE_CHECKING:
     import random
 
-    from protos.model.members import Peer
-    from sidecar.core.path.keys import PathKeys, SealingKeys
+    from plr.protos.model.members import Peer
+    from plr.sidecar.core.path.keys import PathKeys, SealingKeys
 
 
 @lru_cache(maxsize=65536)

@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from controlplane.__main__ import main as controlplane
-from controlplane.cli import __main__
-from protos.program.command_line import main as plr
-from sidecar.__main__ import main as sidecar
+from plr.controlplane.__main__ import main as controlplane
+from plr.controlplane.cli import __main__
+from plr.protos.program.command_line import main as plr
+from plr.sidecar.__main__ import main as sidecar
 from tests.support.free_ports import free_port
 
 if TYPE_CHECKING:
@@ -122,7 +122,7 @@ def test_a_trace_or_recording_that_is_none_is_not_waited_for(
 
 PRINTS = """
     import sys
-    from protos.program.endings import ends_quietly
+    from plr.protos.program.endings import ends_quietly
     sys.exit(ends_quietly("plr")(lambda: print("\\u65e5\\u2026\\udcff") or 0)())
 """
 
@@ -145,11 +145,11 @@ def test_what_the_locale_has_no_character_for_is_escaped(locale: dict[str, str])
 
 BEGINS = """
     import os, signal, sys
-    from protos.program.entry import end_by_ctrl_c
+    from plr.protos.program.entry import end_by_ctrl_c
     {before}
     end_by_ctrl_c()
     os.kill(os.getpid(), signal.SIGINT)
-    from protos.program.endings import ends_quietly
+    from plr.protos.program.endings import ends_quietly
     @ends_quietly("plr")
     def main():
         os.kill(os.getpid(), signal.SIGINT)

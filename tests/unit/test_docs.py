@@ -14,27 +14,27 @@ import pytest
 from pydantic import BaseModel
 from pydantic_core import PydanticUndefined
 
-from controlplane.ca import key_file, passphrase
-from controlplane.ca.authority import DEFAULT_DAYS
-from controlplane.ca.request import MAX_REQUEST_BYTES
-from controlplane.config.controlplane import ControlPlaneConfig
-from controlplane.core.control.control import ControlCore
-from controlplane.observe.fleet_metrics import Fleet
-from controlplane.observe.metrics import Metrics
-from protos.base.histogram import Histogram
-from protos.convert.fields import MAX_CRL_BYTES
-from protos.model.ids import InterfaceName, NodeName, ServiceName
-from protos.program.tls_files import MAX_FILE_BYTES
-from protos.trust.identity import MAX_CA_CERTIFICATES, Identity, IdentityRole, RevocationList
-from sidecar.config.sidecar import SidecarConfig
-from sidecar.control.client import JUDGE_AGAIN_S
-from sidecar.control.revocations import RevocationState
-from sidecar.core.control.session import ControlStats
-from sidecar.core.engine.revocation_exchange import ASK_AGAIN_S, ASK_NEXT_AFTER_S
-from sidecar.core.seam.stats import EngineStats, LinkStats
-from sidecar.core.wire.messages import RevocationsHeld, encode_message
-from sidecar.observe.metrics import MetricSources, SidecarCollector
-from sidecar.ros.stats import BridgeStats
+from plr.controlplane.ca import key_file, passphrase
+from plr.controlplane.ca.authority import DEFAULT_DAYS
+from plr.controlplane.ca.request import MAX_REQUEST_BYTES
+from plr.controlplane.config.controlplane import ControlPlaneConfig
+from plr.controlplane.core.control.control import ControlCore
+from plr.controlplane.observe.fleet_metrics import Fleet
+from plr.controlplane.observe.metrics import Metrics
+from plr.protos.base.histogram import Histogram
+from plr.protos.convert.fields import MAX_CRL_BYTES
+from plr.protos.model.ids import InterfaceName, NodeName, ServiceName
+from plr.protos.program.tls_files import MAX_FILE_BYTES
+from plr.protos.trust.identity import MAX_CA_CERTIFICATES, Identity, IdentityRole, RevocationList
+from plr.sidecar.config.sidecar import SidecarConfig
+from plr.sidecar.control.client import JUDGE_AGAIN_S
+from plr.sidecar.control.revocations import RevocationState
+from plr.sidecar.core.control.session import ControlStats
+from plr.sidecar.core.engine.revocation_exchange import ASK_AGAIN_S, ASK_NEXT_AFTER_S
+from plr.sidecar.core.seam.stats import EngineStats, LinkStats
+from plr.sidecar.core.wire.messages import RevocationsHeld, encode_message
+from plr.sidecar.observe.metrics import MetricSources, SidecarCollector
+from plr.sidecar.ros.stats import BridgeStats
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -147,7 +147,7 @@ def _sidecar_metrics() -> Iterator[Metric]:
 
 
 def _control_metrics() -> Iterator[Metric]:
-    from controlplane.core.control.events import Settings
+    from plr.controlplane.core.control.events import Settings
 
     metrics = Metrics()
     metrics.watch_fleet(lambda: Fleet((), (), {}, 0.0, 0.0))

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from protos.program import commit, extras
+from plr.protos.program import commit, extras
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 ROOT = Path(__file__).parents[2]
 
 SOLVER = ("ortools", "pandas", "grpc_health", "grpc_reflection")
-_COMMAND = {"protos.program.command_line": ("doctor",), "controlplane.cli": ("status",)}
+_COMMAND = {"plr.protos.program.command_line": ("doctor",), "plr.controlplane.cli": ("status",)}
 SIDECAR = ("pyroute2", "sdnotify", "zfec", "prometheus_client")
 
 
@@ -40,21 +40,21 @@ def start(module: str, absent: Sequence[str], *arguments: str) -> subprocess.Com
 @pytest.mark.audit("ops-9")
 @pytest.mark.ros
 def test_a_sidecar_needs_nothing_of_the_control_plane() -> None:
-    done = without(SOLVER, "import sidecar.__main__, sidecar.runtime")
+    done = without(SOLVER, "import plr.sidecar.__main__, plr.sidecar.runtime")
     assert done.returncode == 0, done.stderr
 
 
 @pytest.mark.audit("ops-9")
 def test_a_sidecar_has_no_numpy_but_that_of_ros() -> None:
     modules = sorted(
-        ".".join(file.relative_to(ROOT).with_suffix("").parts)
+        ".".join(("plr", *file.relative_to(ROOT).with_suffix("").parts))
         for folder in ("sidecar/core", "sidecar/net")
         for file in (ROOT / folder).rglob("*.py")
     )
     code = "h = Histogram(); h.record(1.0); h.merge(h.copy()); h.to_sparse()"
-    counted = f"from protos.base.histogram import Histogram\n{code}"
+    counted = f"from plr.protos.base.histogram import Histogram\n{code}"
     done = without(
-        ("numpy", *SOLVER), f"import {', '.join(modules)}, sidecar.observe.metrics\n{counted}; h.quantile(0.5)"
+        ("numpy", *SOLVER), f"import {', '.join(modules)}, plr.sidecar.observe.metrics\n{counted}; h.quantile(0.5)"
     )
     assert done.returncode == 0, done.stderr
 
@@ -63,7 +63,7 @@ def test_a_sidecar_has_no_numpy_but_that_of_ros() -> None:
 def test_an_operator_needs_no_extra() -> None:
     code = """
 import contextlib, io
-from controlplane.cli.__main__ import main
+from plr.controlplane.cli.__main__ import main
 for line in ("status --help", "explain --help", "events --help", "plan --help", "ca --help", "policy --help"):
     with contextlib.suppress(SystemExit), contextlib.redirect_stdout(io.StringIO()):
         main(line.split())
@@ -77,8 +77,8 @@ sys.exit(main(["config", "schema", "sidecar"]))
 @pytest.mark.parametrize(
     ("module", "name", "absent", "extra"),
     [
-        ("controlplane", "plr-controlplane", ("ortools", "sdnotify"), "controlplane"),
-        ("sidecar", "plr-sidecar", ("zfec",), "sidecar"),
+        ("plr.controlplane", "plr-controlplane", ("ortools", "sdnotify"), "controlplane"),
+        ("plr.sidecar", "plr-sidecar", ("zfec",), "sidecar"),
     ],
 )
 def test_a_program_without_its_extra_says_which(module: str, name: str, absent: tuple[str, ...], extra: str) -> None:
@@ -92,10 +92,10 @@ def test_a_program_without_its_extra_says_which(module: str, name: str, absent: 
 @pytest.mark.parametrize(
     ("module", "name", "extra", "absent"),
     [
-        ("controlplane", "plr-controlplane", "controlplane", "cryptography"),
-        ("sidecar", "plr-sidecar", "sidecar", "yaml"),
-        ("protos.program.command_line", "plr", "sidecar", "pydantic"),
-        ("controlplane.cli", "plr", "controlplane", "grpc"),
+        ("plr.controlplane", "plr-controlplane", "controlplane", "cryptography"),
+        ("plr.sidecar", "plr-sidecar", "sidecar", "yaml"),
+        ("plr.protos.program.command_line", "plr", "sidecar", "pydantic"),
+        ("plr.controlplane.cli", "plr", "controlplane", "grpc"),
     ],
 )
 def test_a_program_without_a_dependency_says_what_to_install(module: str, name: str, extra: str, absent: str) -> None:
@@ -108,7 +108,7 @@ def test_a_program_without_a_dependency_says_what_to_install(module: str, name: 
 
 @pytest.mark.audit("ops-9")
 def test_planning_without_its_extra_says_which() -> None:
-    done = start("controlplane.cli", ("numpy",), "plan", "--recorded", "none.json")
+    done = start("plr.controlplane.cli", ("numpy",), "plan", "--recorded", "none.json")
     assert done.returncode == 2
     assert done.stderr == (
         "plr plan: numpy not installed: needs the extra controlplane; in the checkout: pip install '.[controlplane]'\n"
@@ -152,6 +152,9 @@ def checkout(tmp_path: Path) -> Path:
     (folder / "sidecar").mkdir()
     for name in ("__init__.py", "stays.py", "goes.py"):
         (folder / "sidecar" / name).touch()
+    (folder / "plr").mkdir()
+    for name in ("protos", "sidecar"):
+        (folder / "plr" / name).symlink_to(f"../{name}")
     return folder
 
 
@@ -171,15 +174,21 @@ def content(wheel: Path) -> dict[str, str]:
 
 @pytest.mark.audit("ops-10")
 def test_a_wheel_holds_no_module_that_is_gone(checkout: Path) -> None:
-    assert "sidecar/goes.py" in content(build(checkout))
+    assert "plr/sidecar/goes.py" in content(build(checkout))
     (checkout / "sidecar/goes.py").unlink()
     # As an earlier setuptools, or another version of ours, left it.
-    left = checkout / "build/lib/sidecar/left.py"
+    left = checkout / "build/lib/plr/sidecar/left.py"
     left.parent.mkdir(parents=True)
     left.touch()
     held = content(build(checkout))
-    assert "sidecar/stays.py" in held
-    assert not {"sidecar/goes.py", "sidecar/left.py"} & held.keys()
+    assert "plr/sidecar/stays.py" in held
+    assert not {"plr/sidecar/goes.py", "plr/sidecar/left.py"} & held.keys()
+
+
+def test_a_wheel_owns_one_name_alone(checkout: Path) -> None:
+    """PyPI has packages called `sidecar` and `protos`: in one environment with ours, neither replaces the other."""
+    tops = {name.partition("/")[0] for name in content(build(checkout))}
+    assert {top for top in tops if not top.endswith(".dist-info")} == {"plr"}
 
 
 @pytest.mark.audit("ops-10")
@@ -189,7 +198,7 @@ def test_a_wheel_names_its_commit_and_licence(checkout: Path) -> None:
     git(checkout, "commit", "--quiet", "--message", "all")
     head = git(checkout, "rev-parse", "--short=12", "HEAD").strip()
     held = content(build(checkout))
-    assert held["protos/program/commit.txt"] == f"{head}\n"
+    assert held["plr/protos/program/commit.txt"] == f"{head}\n"
     assert not (checkout / "protos/program/commit.txt").exists(), "it would go on to say so of later commits"
     metadata = next(text for name, text in held.items() if name.endswith("/METADATA"))
     assert "\nLicense-Expression: Apache-2.0\n" in metadata
@@ -201,7 +210,7 @@ def test_without_git_a_wheel_names_no_commit(checkout: Path) -> None:
     # Inside another project's checkout, whose commit is not ours.
     git(checkout.parent, "init", "--quiet")
     git(checkout.parent, "commit", "--quiet", "--allow-empty", "--message", "another")
-    assert "protos/program/commit.txt" not in content(build(checkout))
+    assert "plr/protos/program/commit.txt" not in content(build(checkout))
 
 
 @pytest.mark.audit("ops-10")

@@ -23,33 +23,33 @@ from cryptography.hazmat.primitives.asymmetric.x25519 import X25519PrivateKey, X
 from cryptography.hazmat.primitives.ciphers.aead import AESGCM, ChaCha20Poly1305
 from cryptography.hazmat.primitives.serialization import Encoding
 
-from protos.base.errors import DecodeError
-from protos.model.ids import PROTOCOL_VERSION, InterfaceId, InterfaceName, NodeName, Role, ServiceName
-from protos.model.members import Candidate, CandidateKind
-from protos.trust.candidate_signature import signed_bytes, verify_candidates
-from protos.trust.credential import Aead, SessionCredential, decode_credential, session_number, verify
-from protos.trust.identity import Trust
-from protos.trust.pair_token import pair_token
-from sidecar.core.base.request_id import OBSERVED_ONE_IN
-from sidecar.core.base.values import Priority, RejectReason, RequestId
-from sidecar.core.crypto import session
-from sidecar.core.crypto.key_schedule import pair_keys
-from sidecar.core.engine.peers import RESTART_GAP_S
-from sidecar.core.engine.verification_budget import ALL_LOOKS_AT_ONCE, ALL_LOOKS_PER_S, LOOKS_PER_S
-from sidecar.core.link import path_table
-from sidecar.core.message import reassembly
-from sidecar.core.path import address, key_exchange
-from sidecar.core.path.key_exchange import DEFAULT_LIMITS
-from sidecar.core.path.keys import LATE_S, MAX_FAILED, PathKeys, make_path_keys
-from sidecar.core.transfer import outbox
-from sidecar.core.wire import fec, frame, introduction, messages
-from sidecar.core.wire.frame import Header
+from plr.protos.base.errors import DecodeError
+from plr.protos.model.ids import PROTOCOL_VERSION, InterfaceId, InterfaceName, NodeName, Role, ServiceName
+from plr.protos.model.members import Candidate, CandidateKind
+from plr.protos.trust.candidate_signature import signed_bytes, verify_candidates
+from plr.protos.trust.credential import Aead, SessionCredential, decode_credential, session_number, verify
+from plr.protos.trust.identity import Trust
+from plr.protos.trust.pair_token import pair_token
+from plr.sidecar.core.base.request_id import OBSERVED_ONE_IN
+from plr.sidecar.core.base.values import Priority, RejectReason, RequestId
+from plr.sidecar.core.crypto import session
+from plr.sidecar.core.crypto.key_schedule import pair_keys
+from plr.sidecar.core.engine.peers import RESTART_GAP_S
+from plr.sidecar.core.engine.verification_budget import ALL_LOOKS_AT_ONCE, ALL_LOOKS_PER_S, LOOKS_PER_S
+from plr.sidecar.core.link import path_table
+from plr.sidecar.core.message import reassembly
+from plr.sidecar.core.path import address, key_exchange
+from plr.sidecar.core.path.key_exchange import DEFAULT_LIMITS
+from plr.sidecar.core.path.keys import LATE_S, MAX_FAILED, PathKeys, make_path_keys
+from plr.sidecar.core.transfer import outbox
+from plr.sidecar.core.wire import fec, frame, introduction, messages
+from plr.sidecar.core.wire.frame import Header
 from tests.support.sessions import seal
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from sidecar.core.crypto.key_schedule import PairKeys
+    from plr.sidecar.core.crypto.key_schedule import PairKeys
 
 DOCS = Path(__file__).parents[2] / "docs" / "develop"
 PAGE = (DOCS / "protocol.md").read_text(encoding="utf-8")

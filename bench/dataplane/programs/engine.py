@@ -18,25 +18,25 @@ from typing import TYPE_CHECKING, Any
 from bench.dataplane.calling import HEADER, Caller, Plan, usage
 from bench.dataplane.remote import serve
 from bench.null_cipher import install
-from protos.model.ids import InterfaceName, NodeName, Role, ServiceName, SessionId, Version
-from protos.model.mapping import Assignment, MappingSet, ServiceMapping
-from protos.model.members import ALL_CALLS, Candidate, CandidateKind, Peer, PeerSet, ServiceOffer
-from protos.program import interpreter
-from protos.trust.clock_floor import ClockFloor
-from protos.trust.pair_token import pair_token
-from sidecar.config.sidecar import SidecarConfig
-from sidecar.core.base.values import RequestId
-from sidecar.core.engine.engine import EngineConfig
-from sidecar.core.seam.application import ExecuteRequest, OfferService, RequestFailed, ResponseArrived
-from sidecar.net.dataplane import DataPlaneHooks, ThreadedDataPlane
-from sidecar.net.interface_manager import InterfaceManager
-from sidecar.state.start_session import start_session
+from plr.protos.model.ids import InterfaceName, NodeName, Role, ServiceName, SessionId, Version
+from plr.protos.model.mapping import Assignment, MappingSet, ServiceMapping
+from plr.protos.model.members import ALL_CALLS, Candidate, CandidateKind, Peer, PeerSet, ServiceOffer
+from plr.protos.program import interpreter
+from plr.protos.trust.clock_floor import ClockFloor
+from plr.protos.trust.pair_token import pair_token
+from plr.sidecar.config.sidecar import SidecarConfig
+from plr.sidecar.core.base.values import RequestId
+from plr.sidecar.core.engine.engine import EngineConfig
+from plr.sidecar.core.seam.application import ExecuteRequest, OfferService, RequestFailed, ResponseArrived
+from plr.sidecar.net.dataplane import DataPlaneHooks, ThreadedDataPlane
+from plr.sidecar.net.interface_manager import InterfaceManager
+from plr.sidecar.state.start_session import start_session
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from protos.trust.credential import SessionCredential
-    from sidecar.core.seam.application import ApplicationEvent
+    from plr.protos.trust.credential import SessionCredential
+    from plr.sidecar.core.seam.application import ApplicationEvent
 
 SERVICE = ServiceName("/bench")
 TYPE = "bench/srv/Bytes"
@@ -140,7 +140,7 @@ class EngineProgram:
             self._plane.stop()
             self._interfaces.stop()
 
-    # -- sidecar.ports.Application, on the data plane's threads ---------------------------------------------------
+    # -- plr.sidecar.ports.Application, on the data plane's threads ---------------------------------------------------
 
     def handle(self, event: ApplicationEvent) -> None:
         """Take an event."""

@@ -15,9 +15,9 @@ from cryptography.hazmat.primitives.asymmetric.x25519 import X25519PrivateKey
 from bench.dataplane.ours import SERVICE, Ours
 from bench.dataplane.section import Findings, Section, table_of
 from bench.dataplane.statistics import MS, Row, goodput_of_stretches, interval, median, median_ratio, p99_ratio
-from protos.trust.credential import Aead
-from sidecar.core.crypto.key_schedule import PairKeys
-from sidecar.core.path.key_exchange import RENEW_AFTER_S, KeyExchange, KeyLimits
+from plr.protos.trust.credential import Aead
+from plr.sidecar.core.crypto.key_schedule import PairKeys
+from plr.sidecar.core.path.key_exchange import RENEW_AFTER_S, KeyExchange, KeyLimits
 
 if TYPE_CHECKING:
     from bench.dataplane.section import Context

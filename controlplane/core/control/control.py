@@ -12,7 +12,7 @@ from collections import Counter, deque
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, assert_never
 
-from controlplane.core.control.events import (
+from plr.controlplane.core.control.events import (
     Counters,
     CutOffNotice,
     DepartureNotice,
@@ -23,51 +23,51 @@ from controlplane.core.control.events import (
     StreamLostNotice,
     UnmetNotice,
 )
-from controlplane.core.control.schedule import Change, Debounce
-from controlplane.core.estimate.estimator import Estimator
-from controlplane.core.estimate.reached import Reached
-from controlplane.core.estimate.unanswered import Unanswered
-from controlplane.core.explain.departed import Departed, Departure, departure, last_known, why_removed
-from controlplane.core.explain.departed_explanation import explain_departed
-from controlplane.core.explain.explanation import explain, find
-from controlplane.core.explain.fleet_view import MemberView, view_of
-from controlplane.core.explain.returning import Returning
-from controlplane.core.explain.status import is_met, is_offered, statuses
-from controlplane.core.formulation.block import Picture
-from controlplane.core.formulation.problem_builder import MAX_INTERFACES, Drawing
-from controlplane.core.overload.pacing import Pacing
-from controlplane.core.overload.urgency import Urgency
-from controlplane.core.policy.cut_off import cut_off
-from controlplane.core.policy.permits import Permits
-from controlplane.core.policy.refused_offers import RefusedOffers
-from controlplane.core.policy.report_filter import believable
-from controlplane.core.problem.plan import Plan
-from controlplane.core.problem.problem import BlockKey, Problem
-from controlplane.core.publish.history import MappingHistory
-from controlplane.core.publish.mappings import changed_robots
-from controlplane.core.publish.messages import Close, CloseReason, Send
-from controlplane.core.publish.publisher import Publisher
-from controlplane.core.registry.registry import Admission, Refusal, Registry, StreamId
-from controlplane.core.registry.restlessness import Restlessness
-from controlplane.core.settle.explored_pair import Exploration
-from controlplane.core.settle.stability import Stability
-from protos.base.errors import DecodeError
-from protos.model.fleet_events import Why
-from protos.model.ids import Role
-from protos.model.mapping import MappingSet
-from protos.model.members import CandidateSet, Registration, RemovalReason, RevocationSet, ServiceSet
-from protos.model.report import Report
-from protos.model.stream import Ack, Drain, Heartbeat, Nack, ResourceKind, Welcome
+from plr.controlplane.core.control.schedule import Change, Debounce
+from plr.controlplane.core.estimate.estimator import Estimator
+from plr.controlplane.core.estimate.reached import Reached
+from plr.controlplane.core.estimate.unanswered import Unanswered
+from plr.controlplane.core.explain.departed import Departed, Departure, departure, last_known, why_removed
+from plr.controlplane.core.explain.departed_explanation import explain_departed
+from plr.controlplane.core.explain.explanation import explain, find
+from plr.controlplane.core.explain.fleet_view import MemberView, view_of
+from plr.controlplane.core.explain.returning import Returning
+from plr.controlplane.core.explain.status import is_met, is_offered, statuses
+from plr.controlplane.core.formulation.block import Picture
+from plr.controlplane.core.formulation.problem_builder import MAX_INTERFACES, Drawing
+from plr.controlplane.core.overload.pacing import Pacing
+from plr.controlplane.core.overload.urgency import Urgency
+from plr.controlplane.core.policy.cut_off import cut_off
+from plr.controlplane.core.policy.permits import Permits
+from plr.controlplane.core.policy.refused_offers import RefusedOffers
+from plr.controlplane.core.policy.report_filter import believable
+from plr.controlplane.core.problem.plan import Plan
+from plr.controlplane.core.problem.problem import BlockKey, Problem
+from plr.controlplane.core.publish.history import MappingHistory
+from plr.controlplane.core.publish.mappings import changed_robots
+from plr.controlplane.core.publish.messages import Close, CloseReason, Send
+from plr.controlplane.core.publish.publisher import Publisher
+from plr.controlplane.core.registry.registry import Admission, Refusal, Registry, StreamId
+from plr.controlplane.core.registry.restlessness import Restlessness
+from plr.controlplane.core.settle.explored_pair import Exploration
+from plr.controlplane.core.settle.stability import Stability
+from plr.protos.base.errors import DecodeError
+from plr.protos.model.fleet_events import Why
+from plr.protos.model.ids import Role
+from plr.protos.model.mapping import MappingSet
+from plr.protos.model.members import CandidateSet, Registration, RemovalReason, RevocationSet, ServiceSet
+from plr.protos.model.report import Report
+from plr.protos.model.stream import Ack, Drain, Heartbeat, Nack, ResourceKind, Welcome
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Iterable, Iterator, Set
 
-    from controlplane.core.policy.policy import Policy
-    from controlplane.core.registry.registry import Sidecar
-    from protos.model.explanation import Explanation
-    from protos.model.ids import NodeName, ServiceName
-    from protos.model.status import SidecarStatus, SyncState
-    from protos.model.stream import SidecarMessage
+    from plr.controlplane.core.policy.policy import Policy
+    from plr.controlplane.core.registry.registry import Sidecar
+    from plr.protos.model.explanation import Explanation
+    from plr.protos.model.ids import NodeName, ServiceName
+    from plr.protos.model.status import SidecarStatus, SyncState
+    from plr.protos.model.stream import SidecarMessage
 
 RESTLESS_DELAY_S = 1.0
 """Delay of publication for a member that comes and goes beyond its share."""

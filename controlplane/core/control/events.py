@@ -6,15 +6,15 @@ from collections import Counter
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
-from controlplane.core.problem.problem import Objective
-from controlplane.core.publish.messages import Close, Send
+from plr.controlplane.core.problem.problem import Objective
+from plr.controlplane.core.publish.messages import Close, Send
 
 if TYPE_CHECKING:
-    from controlplane.core.explain.departed import Departure
-    from controlplane.core.policy.path_rules import PathRule
-    from controlplane.core.policy.policy import Policy
-    from protos.model.ids import NodeName, Role, ServiceName
-    from protos.model.stream import Nack, ResourceKind
+    from plr.controlplane.core.explain.departed import Departure
+    from plr.controlplane.core.policy.path_rules import PathRule
+    from plr.controlplane.core.policy.policy import Policy
+    from plr.protos.model.ids import NodeName, Role, ServiceName
+    from plr.protos.model.stream import Nack, ResourceKind
 
 
 @dataclass(frozen=True, slots=True)

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from controlplane.core.estimate.posterior import Estimate
+    from plr.controlplane.core.estimate.posterior import Estimate
 
     Floats = NDArray[np.float64]
 

@@ -13,12 +13,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from protos.base.histogram import BUCKETS, GROWTH
+from plr.protos.base.histogram import BUCKETS, GROWTH
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from protos.base.histogram import Histogram
+    from plr.protos.base.histogram import Histogram
 
 _PER_BIN = round(math.log(2.0) / math.log(GROWTH))
 """Buckets of a histogram that count as one: times up to twice as long."""

@@ -6,14 +6,14 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from controlplane.core.estimate.posterior import IGNORANCE, Estimate
+from plr.controlplane.core.estimate.posterior import IGNORANCE, Estimate
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from controlplane.core.estimate.network import RobotNetwork, Witness
-    from controlplane.core.estimate.processing import ServerTimes
-    from protos.model.ids import InterfaceName, NodeName
+    from plr.controlplane.core.estimate.network import RobotNetwork, Witness
+    from plr.controlplane.core.estimate.processing import ServerTimes
+    from plr.protos.model.ids import InterfaceName, NodeName
 
 MODEL_REQUESTS = 5.0
 """Worth of an estimate from parts (network and processing), in real requests of the very service ..."""

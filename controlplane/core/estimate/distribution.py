@@ -1,4 +1,4 @@
-"""Represents distributions of latencies in the buckets of `protos.base.histogram`, and how likely a sum is too slow."""
+"""Represents latency distributions in the buckets of `plr.protos.base.histogram`, and how likely a sum is too slow."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from protos.base.histogram import BUCKETS, EDGES, MAX_S, MIDS
+from plr.protos.base.histogram import BUCKETS, EDGES, MAX_S, MIDS
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

@@ -11,19 +11,19 @@ from collections import OrderedDict
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, TypeVar
 
-from controlplane.core.estimate.composed import Asked, from_parts, parts_of, slower_than
-from controlplane.core.estimate.fading import FadedCount, FadedShares, forget_after_s, forget_before
-from controlplane.core.estimate.interface_trouble import InterfaceTrouble
-from controlplane.core.estimate.late_fate import LateFate
-from controlplane.core.estimate.network import PathView, RobotNetwork
-from controlplane.core.estimate.penalties import Penalties
-from controlplane.core.estimate.posterior import IGNORANCE, Estimate, FadedTrials
-from controlplane.core.estimate.processing import ComputeTimes, ServerTimes
-from controlplane.core.estimate.shared_fate import SharedFate
-from controlplane.core.estimate.staleness import HeardClock
-from protos.base.histogram import Histogram
-from protos.base.size_class import SIZE_CLASSES
-from protos.model.explanation import SAMPLE
+from plr.controlplane.core.estimate.composed import Asked, from_parts, parts_of, slower_than
+from plr.controlplane.core.estimate.fading import FadedCount, FadedShares, forget_after_s, forget_before
+from plr.controlplane.core.estimate.interface_trouble import InterfaceTrouble
+from plr.controlplane.core.estimate.late_fate import LateFate
+from plr.controlplane.core.estimate.network import PathView, RobotNetwork
+from plr.controlplane.core.estimate.penalties import Penalties
+from plr.controlplane.core.estimate.posterior import IGNORANCE, Estimate, FadedTrials
+from plr.controlplane.core.estimate.processing import ComputeTimes, ServerTimes
+from plr.controlplane.core.estimate.shared_fate import SharedFate
+from plr.controlplane.core.estimate.staleness import HeardClock
+from plr.protos.base.histogram import Histogram
+from plr.protos.base.size_class import SIZE_CLASSES
+from plr.protos.model.explanation import SAMPLE
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
@@ -31,12 +31,12 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from controlplane.core.estimate.composed import Parts
-    from controlplane.core.estimate.network import PathState
-    from controlplane.core.estimate.shared_fate import CommonMisses
-    from protos.model.ids import InterfaceName, NodeName, ServiceName
-    from protos.model.mapping import Assignment
-    from protos.model.report import JointReport, LatencyReport, PathReport, PenaltyReport, Report
+    from plr.controlplane.core.estimate.composed import Parts
+    from plr.controlplane.core.estimate.network import PathState
+    from plr.controlplane.core.estimate.shared_fate import CommonMisses
+    from plr.protos.model.ids import InterfaceName, NodeName, ServiceName
+    from plr.protos.model.mapping import Assignment
+    from plr.protos.model.report import JointReport, LatencyReport, PathReport, PenaltyReport, Report
 
     Pair = tuple[InterfaceName, NodeName, ServiceName]
     JointKey = tuple[ServiceName, Assignment, Assignment]
@@ -86,7 +86,7 @@ LIVE_S = 60.0
 
 @dataclass(frozen=True, slots=True)
 class Evidence:
-    """What an estimate rests on; in the histograms, an unfaded sample counts `protos.model.explanation.SAMPLE`."""
+    """What an estimate rests on; in the histograms, an unfaded sample counts `plr.protos.model.explanation.SAMPLE`."""
 
     requests: float
     probes: float

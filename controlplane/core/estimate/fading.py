@@ -13,10 +13,10 @@ from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 
-from controlplane.core.estimate.distribution import Distribution
-from controlplane.core.estimate.staleness import Silence
-from protos.base.histogram import BUCKETS, MAX_COUNT, MIDS, Histogram
-from protos.base.size_class import SIZE_CLASSES
+from plr.controlplane.core.estimate.distribution import Distribution
+from plr.controlplane.core.estimate.staleness import Silence
+from plr.protos.base.histogram import BUCKETS, MAX_COUNT, MIDS, Histogram
+from plr.protos.base.size_class import SIZE_CLASSES
 
 if TYPE_CHECKING:
     from collections import OrderedDict
@@ -24,8 +24,8 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from controlplane.core.estimate.change_detection import ChangeWatch
-    from controlplane.core.estimate.staleness import HeardClock
+    from plr.controlplane.core.estimate.change_detection import ChangeWatch
+    from plr.controlplane.core.estimate.staleness import HeardClock
 
 _FORGOTTEN = 1e-9
 """Samples that together weigh less count as none: soon after, floats run out of range."""
@@ -99,7 +99,7 @@ class FadedShares:
 
 
 class FadedHistogram:
-    """Weights of the buckets of `protos.base.histogram` and of the lost, fading with a half-life in seconds.
+    """Weights of the buckets of `plr.protos.base.histogram` and of the lost, fading with a half-life in seconds.
 
     Called-off samples count for as long as they lasted: `distribution` follows Kaplan and Meier. With the clock of its
     group, a histogram fades faster while only others of the group are heard of.

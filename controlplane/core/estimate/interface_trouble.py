@@ -9,10 +9,10 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING
 
-from controlplane.core.estimate.posterior import Estimate
+from plr.controlplane.core.estimate.posterior import Estimate
 
 if TYPE_CHECKING:
-    from protos.model.ids import InterfaceName, NodeName
+    from plr.protos.model.ids import InterfaceName, NodeName
 
 SUREST = 1e-9
 """No probability is taken to be nearer to 0 or 1 than this."""

@@ -9,8 +9,8 @@ from __future__ import annotations
 
 import math
 
-from controlplane.core.estimate.fading import FadedCount
-from controlplane.core.estimate.posterior import USUAL_STREAK
+from plr.controlplane.core.estimate.fading import FadedCount
+from plr.controlplane.core.estimate.posterior import USUAL_STREAK
 
 HALF_LIFE_S = 600.0
 """As for interfaces that fail together: places change, carriers do not."""

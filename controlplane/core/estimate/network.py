@@ -15,9 +15,9 @@ from itertools import islice
 from statistics import median
 from typing import TYPE_CHECKING, NamedTuple, TypeVar
 
-from controlplane.core.estimate.fading import FadedCount, FadedHistogram, forget_before
-from controlplane.core.estimate.staleness import HeardClock
-from protos.base.histogram import Histogram
+from plr.controlplane.core.estimate.fading import FadedCount, FadedHistogram, forget_before
+from plr.controlplane.core.estimate.staleness import HeardClock
+from plr.protos.base.histogram import Histogram
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
@@ -25,9 +25,9 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from controlplane.core.estimate.distribution import Distribution
-    from protos.model.ids import InterfaceName, NodeName
-    from protos.model.report import LatencyReport, PathReport
+    from plr.controlplane.core.estimate.distribution import Distribution
+    from plr.protos.model.ids import InterfaceName, NodeName
+    from plr.protos.model.report import LatencyReport, PathReport
 
     PathKey = tuple[InterfaceName, NodeName]
     CellKey = tuple[InterfaceName, NodeName, int]

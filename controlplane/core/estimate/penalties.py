@@ -8,15 +8,15 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from protos.model.report import PenaltyReport
+from plr.protos.model.report import PenaltyReport
 
 if TYPE_CHECKING:
     from collections.abc import Collection
 
-    from protos.model.ids import NodeName
+    from plr.protos.model.ids import NodeName
 
 LONGEST_S = 600.0
-"""No sidecar penalises a server for longer (`sidecar.core.robot.dispatch.penalties`), whatever it reports."""
+"""No sidecar penalises a server for longer (`plr.sidecar.core.robot.dispatch.penalties`), whatever it reports."""
 
 
 class Penalties:

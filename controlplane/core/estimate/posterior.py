@@ -6,10 +6,10 @@ import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from controlplane.core.estimate.staleness import Silence
+from plr.controlplane.core.estimate.staleness import Silence
 
 if TYPE_CHECKING:
-    from controlplane.core.estimate.staleness import HeardClock
+    from plr.controlplane.core.estimate.staleness import HeardClock
 
 MEMORIES = ((1.0, 1.0), (1 / 4, 0.3), (1 / 15, 0.3))
 """Half-lives of the parallel memories, as parts of the configured one, and the prior probability that each is the best:

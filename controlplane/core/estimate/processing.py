@@ -6,15 +6,15 @@ from collections import OrderedDict
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, NamedTuple
 
-from controlplane.core.estimate.change_detection import ChangeWatch
-from controlplane.core.estimate.distribution import Distribution
-from controlplane.core.estimate.fading import FadedCount, FadedHistogram, forget_after_s
-from controlplane.core.estimate.staleness import HeardClock
-from controlplane.core.estimate.witnesses import COUNTS_ANYWAY, Witnesses
-from protos.base.histogram import Histogram
+from plr.controlplane.core.estimate.change_detection import ChangeWatch
+from plr.controlplane.core.estimate.distribution import Distribution
+from plr.controlplane.core.estimate.fading import FadedCount, FadedHistogram, forget_after_s
+from plr.controlplane.core.estimate.staleness import HeardClock
+from plr.controlplane.core.estimate.witnesses import COUNTS_ANYWAY, Witnesses
+from plr.protos.base.histogram import Histogram
 
 if TYPE_CHECKING:
-    from protos.model.ids import NodeName, ServiceName
+    from plr.protos.model.ids import NodeName, ServiceName
 
 MAX_PROCESSING = 8192
 """Processing histograms kept, one for each (server, service); the least recently reported one is evicted."""

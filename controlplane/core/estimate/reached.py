@@ -11,7 +11,7 @@ from collections import Counter, OrderedDict
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from protos.model.ids import NodeName
+    from plr.protos.model.ids import NodeName
 
 MAX_PAIRS = 131_072
 """Pairs of robot and server remembered, also of robots that are gone: as many as 4,096 robots and 32 servers make. The

@@ -13,12 +13,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from controlplane.core.estimate.beta import quantiles
-from controlplane.core.estimate.posterior import BATCH_S, MAX_BATCH_CORRELATION, USUAL_STREAK, USUAL_STREAK_BATCHES
-from protos.model.explanation import Correlation
+from plr.controlplane.core.estimate.beta import quantiles
+from plr.controlplane.core.estimate.posterior import BATCH_S, MAX_BATCH_CORRELATION, USUAL_STREAK, USUAL_STREAK_BATCHES
+from plr.protos.model.explanation import Correlation
 
 if TYPE_CHECKING:
-    from protos.model.report import InterfaceJointReport
+    from plr.protos.model.report import InterfaceJointReport
 
 HALF_LIFE_S = 600.0
 """Carriers do not change, places do: trouble a few minutes apart counts together, that of another district does not."""

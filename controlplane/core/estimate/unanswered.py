@@ -14,13 +14,13 @@ from collections import Counter, OrderedDict
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
-from protos.base.histogram import MAX_COUNT
+from plr.protos.base.histogram import MAX_COUNT
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterable
 
-    from protos.model.ids import NodeName, ServiceName
-    from protos.model.report import LatencyReport
+    from plr.protos.model.ids import NodeName, ServiceName
+    from plr.protos.model.report import LatencyReport
 
     Pair = tuple[NodeName, ServiceName]
 

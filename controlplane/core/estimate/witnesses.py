@@ -13,11 +13,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from controlplane.core.estimate.fading import FadedCount
-from protos.base.histogram import Histogram
+from plr.controlplane.core.estimate.fading import FadedCount
+from plr.protos.base.histogram import Histogram
 
 if TYPE_CHECKING:
-    from protos.model.ids import NodeName
+    from plr.protos.model.ids import NodeName
 
 MAX_WITNESSES = 64
 """Robots remembered for each server and service; the one that reported least recently is evicted."""

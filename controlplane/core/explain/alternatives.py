@@ -8,22 +8,22 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from controlplane.core.problem.costs import block_cost, charge, choice_costs
-from controlplane.core.problem.domains import shared_domains
-from controlplane.core.problem.plan import choice_of
-from controlplane.core.problem.problem import FleetKey, block_excess, loads, reachable
-from controlplane.core.solve.enumeration import MAX_LISTED, list_choices, own_excess
-from protos.model.explanation import Alternative, AlternativeKind
-from protos.model.mapping import Assignment
+from plr.controlplane.core.problem.costs import block_cost, charge, choice_costs
+from plr.controlplane.core.problem.domains import shared_domains
+from plr.controlplane.core.problem.plan import choice_of
+from plr.controlplane.core.problem.problem import FleetKey, block_excess, loads, reachable
+from plr.controlplane.core.solve.enumeration import MAX_LISTED, list_choices, own_excess
+from plr.protos.model.explanation import Alternative, AlternativeKind
+from plr.protos.model.mapping import Assignment
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
 
     from numpy.typing import NDArray
 
-    from controlplane.core.problem.plan import Plan
-    from controlplane.core.problem.problem import Block, Choice, Problem
-    from protos.model.ids import NodeName
+    from plr.controlplane.core.problem.plan import Plan
+    from plr.controlplane.core.problem.problem import Block, Choice, Problem
+    from plr.protos.model.ids import NodeName
 
 OTHERS = 3
 """Number of the best mappings reported that are not in force."""

@@ -12,22 +12,22 @@ from dataclasses import dataclass
 from itertools import islice
 from typing import TYPE_CHECKING
 
-from controlplane.core.problem.problem import BlockKey
-from protos.model.fleet_events import DepartedSidecar, Why
-from protos.model.members import RemovalReason
+from plr.controlplane.core.problem.problem import BlockKey
+from plr.protos.model.fleet_events import DepartedSidecar, Why
+from plr.protos.model.members import RemovalReason
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
 
-    from controlplane.core.estimate.network import PathState
-    from controlplane.core.formulation.block import BlockNotes, Picture
-    from controlplane.core.problem.plan import BlockPlan, Plan
-    from controlplane.core.problem.problem import Objective
-    from controlplane.core.publish.snapshots import Snapshots
-    from controlplane.core.registry.registry import Sidecar
-    from protos.model.ids import InterfaceName, NodeName, Role, ServiceName
-    from protos.model.mapping import ServiceMapping
-    from protos.model.status import ResourceStatus
+    from plr.controlplane.core.estimate.network import PathState
+    from plr.controlplane.core.formulation.block import BlockNotes, Picture
+    from plr.controlplane.core.problem.plan import BlockPlan, Plan
+    from plr.controlplane.core.problem.problem import Objective
+    from plr.controlplane.core.publish.snapshots import Snapshots
+    from plr.controlplane.core.registry.registry import Sidecar
+    from plr.protos.model.ids import InterfaceName, NodeName, Role, ServiceName
+    from plr.protos.model.mapping import ServiceMapping
+    from plr.protos.model.status import ResourceStatus
 
 MAX_DEPARTED = 4096
 """Departed sidecars remembered, as many as can be registered; the one that left longest ago is evicted."""

@@ -5,23 +5,23 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
-from controlplane.core.explain.explanation import UnknownNameError, explain, find_use
-from controlplane.core.formulation.block import Picture
-from controlplane.core.problem.plan import Plan
-from controlplane.core.problem.problem import BlockKey, Problem
-from protos.model.explanation import SAMPLE
+from plr.controlplane.core.explain.explanation import UnknownNameError, explain, find_use
+from plr.controlplane.core.formulation.block import Picture
+from plr.controlplane.core.problem.plan import Plan
+from plr.controlplane.core.problem.problem import BlockKey, Problem
+from plr.protos.model.explanation import SAMPLE
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
 
-    from controlplane.core.estimate.estimator import Estimator, Evidence
-    from controlplane.core.estimate.shared_fate import CommonMisses
-    from controlplane.core.explain.departed import Departure, LastKnown
-    from controlplane.core.publish.history import MappingHistory
-    from protos.model.explanation import Explanation
-    from protos.model.ids import InterfaceName, NodeName, ServiceName
-    from protos.model.mapping import Assignment
-    from protos.model.report import PenaltyReport
+    from plr.controlplane.core.estimate.estimator import Estimator, Evidence
+    from plr.controlplane.core.estimate.shared_fate import CommonMisses
+    from plr.controlplane.core.explain.departed import Departure, LastKnown
+    from plr.controlplane.core.publish.history import MappingHistory
+    from plr.protos.model.explanation import Explanation
+    from plr.protos.model.ids import InterfaceName, NodeName, ServiceName
+    from plr.protos.model.mapping import Assignment
+    from plr.protos.model.report import PenaltyReport
 
 
 class _LastEstimates:

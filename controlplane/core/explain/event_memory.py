@@ -7,12 +7,12 @@ from collections import OrderedDict, deque
 from itertools import islice
 from typing import TYPE_CHECKING
 
-from protos.base.token_bucket import TokenBucket
+from plr.protos.base.token_bucket import TokenBucket
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from protos.model.fleet_events import FleetEvent
+    from plr.protos.model.fleet_events import FleetEvent
 
     Owner = str | None
 

@@ -8,32 +8,32 @@ from __future__ import annotations
 import difflib
 from typing import TYPE_CHECKING, Protocol
 
-from controlplane.core.estimate.beta import intervals
-from controlplane.core.explain import alternatives
-from controlplane.core.formulation.block import BlockNotes, interfaces_of
-from controlplane.core.problem.mode_miss import miss_of, predicted_miss
-from controlplane.core.problem.problem import BlockKey
-from protos.model.explanation import Belief, Explanation, JointExplanation, MappingChange, PairExplanation
-from protos.model.ids import Role
-from protos.model.mapping import Assignment
+from plr.controlplane.core.estimate.beta import intervals
+from plr.controlplane.core.explain import alternatives
+from plr.controlplane.core.formulation.block import BlockNotes, interfaces_of
+from plr.controlplane.core.problem.mode_miss import miss_of, predicted_miss
+from plr.controlplane.core.problem.problem import BlockKey
+from plr.protos.model.explanation import Belief, Explanation, JointExplanation, MappingChange, PairExplanation
+from plr.protos.model.ids import Role
+from plr.protos.model.mapping import Assignment
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterable, Iterator, Mapping
 
-    from controlplane.core.estimate.estimator import Evidence
-    from controlplane.core.estimate.posterior import Estimate
-    from controlplane.core.estimate.shared_fate import CommonMisses
-    from controlplane.core.formulation.block import Picture
-    from controlplane.core.policy.permits import Permits
-    from controlplane.core.problem.plan import BlockPlan, Plan
-    from controlplane.core.problem.problem import Block, Choice
-    from controlplane.core.publish.history import History
-    from controlplane.core.registry.registry import Registry, Sidecar
-    from protos.model.ids import InterfaceName, NodeName, ServiceName
-    from protos.model.mapping import ServiceMapping
-    from protos.model.members import ServiceUse
-    from protos.model.report import PenaltyReport
-    from protos.model.status import ResourceStatus
+    from plr.controlplane.core.estimate.estimator import Evidence
+    from plr.controlplane.core.estimate.posterior import Estimate
+    from plr.controlplane.core.estimate.shared_fate import CommonMisses
+    from plr.controlplane.core.formulation.block import Picture
+    from plr.controlplane.core.policy.permits import Permits
+    from plr.controlplane.core.problem.plan import BlockPlan, Plan
+    from plr.controlplane.core.problem.problem import Block, Choice
+    from plr.controlplane.core.publish.history import History
+    from plr.controlplane.core.registry.registry import Registry, Sidecar
+    from plr.protos.model.ids import InterfaceName, NodeName, ServiceName
+    from plr.protos.model.mapping import ServiceMapping
+    from plr.protos.model.members import ServiceUse
+    from plr.protos.model.report import PenaltyReport
+    from plr.protos.model.status import ResourceStatus
 
 LEVEL = 0.9
 """Probability of the reported intervals."""

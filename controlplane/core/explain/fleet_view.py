@@ -7,26 +7,26 @@ from dataclasses import dataclass
 from itertools import islice
 from typing import TYPE_CHECKING
 
-from controlplane.core.formulation.block import interfaces_of
-from controlplane.core.problem.mode_miss import NO_SENDING, predicted_miss
-from controlplane.core.problem.problem import BlockKey
-from protos.model.ids import Role
-from protos.model.status import SyncState
+from plr.controlplane.core.formulation.block import interfaces_of
+from plr.controlplane.core.problem.mode_miss import NO_SENDING, predicted_miss
+from plr.controlplane.core.problem.problem import BlockKey
+from plr.protos.model.ids import Role
+from plr.protos.model.status import SyncState
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from controlplane.core.estimate.estimator import Estimator
-    from controlplane.core.estimate.network import PathView
-    from controlplane.core.estimate.reached import Reached
-    from controlplane.core.estimate.unanswered import Unanswered
-    from controlplane.core.formulation.block import Picture
-    from controlplane.core.problem.plan import Plan
-    from controlplane.core.publish.snapshots import Snapshots
-    from controlplane.core.registry.registry import Sidecar
-    from protos.model.ids import InterfaceName, NodeName, ServiceName
-    from protos.model.mapping import ServiceMapping
-    from protos.model.members import ServiceUse
+    from plr.controlplane.core.estimate.estimator import Estimator
+    from plr.controlplane.core.estimate.network import PathView
+    from plr.controlplane.core.estimate.reached import Reached
+    from plr.controlplane.core.estimate.unanswered import Unanswered
+    from plr.controlplane.core.formulation.block import Picture
+    from plr.controlplane.core.problem.plan import Plan
+    from plr.controlplane.core.publish.snapshots import Snapshots
+    from plr.controlplane.core.registry.registry import Sidecar
+    from plr.protos.model.ids import InterfaceName, NodeName, ServiceName
+    from plr.protos.model.mapping import ServiceMapping
+    from plr.protos.model.members import ServiceUse
 
 MAX_VIEWED = 512
 """Paths, and services, of one robot that are examined."""

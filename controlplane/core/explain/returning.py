@@ -11,14 +11,14 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
-from protos.model.fleet_events import Why
-from protos.model.ids import Role
+from plr.protos.model.fleet_events import Why
+from plr.protos.model.ids import Role
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Iterable
 
-    from controlplane.core.explain.departed import Departure
-    from protos.model.ids import NodeName
+    from plr.controlplane.core.explain.departed import Departure
+    from plr.protos.model.ids import NodeName
 
 TEXT = "it was there before the control plane was restarted, and did not come back"
 

@@ -5,18 +5,18 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
-from controlplane.core.formulation.block import interfaces_of
-from protos.model.status import SidecarStatus
+from plr.controlplane.core.formulation.block import interfaces_of
+from plr.protos.model.status import SidecarStatus
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
 
-    from controlplane.core.estimate.estimator import Estimator
-    from controlplane.core.estimate.unanswered import Unanswered
-    from controlplane.core.policy.permits import Permits
-    from controlplane.core.publish.publisher import Publisher
-    from controlplane.core.registry.registry import Registry
-    from protos.model.ids import NodeName, ServiceName
+    from plr.controlplane.core.estimate.estimator import Estimator
+    from plr.controlplane.core.estimate.unanswered import Unanswered
+    from plr.controlplane.core.policy.permits import Permits
+    from plr.controlplane.core.publish.publisher import Publisher
+    from plr.controlplane.core.registry.registry import Registry
+    from plr.protos.model.ids import NodeName, ServiceName
 
 
 def is_met(robot: NodeName, server: NodeName, registry: Registry, permits: Permits) -> bool:

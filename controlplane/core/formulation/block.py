@@ -9,21 +9,21 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
-from controlplane.core.estimate.posterior import Estimate
-from controlplane.core.formulation.surplus import most_promising
-from controlplane.core.problem.mode_miss import NO_SENDING, Sending, asked_times, is_timed, pair_timing
-from controlplane.core.problem.problem import Block, BlockKey, Problem, Target
-from protos.model.members import InterfaceLabel
+from plr.controlplane.core.estimate.posterior import Estimate
+from plr.controlplane.core.formulation.surplus import most_promising
+from plr.controlplane.core.problem.mode_miss import NO_SENDING, Sending, asked_times, is_timed, pair_timing
+from plr.controlplane.core.problem.problem import Block, BlockKey, Problem, Target
+from plr.protos.model.members import InterfaceLabel
 
 if TYPE_CHECKING:
     from collections.abc import Generator, Iterable, Mapping
 
-    from controlplane.core.estimate.estimator import Estimator
-    from controlplane.core.problem.mode_miss import PairTiming
-    from controlplane.core.problem.problem import Path
-    from controlplane.core.registry.registry import Sidecar
-    from protos.model.ids import InterfaceName, NodeName, ServiceName
-    from protos.model.members import ServiceUse
+    from plr.controlplane.core.estimate.estimator import Estimator
+    from plr.controlplane.core.problem.mode_miss import PairTiming
+    from plr.controlplane.core.problem.problem import Path
+    from plr.controlplane.core.registry.registry import Sidecar
+    from plr.protos.model.ids import InterfaceName, NodeName, ServiceName
+    from plr.protos.model.members import ServiceUse
 
 
 def with_rules(block: Block, robot: Sidecar, use: ServiceUse, clouds: Iterable[Sidecar]) -> Block:

@@ -12,22 +12,22 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
-from controlplane.core.formulation.block import BlockNotes, Picture, draw_block, interfaces_of
-from controlplane.core.policy.path_rules import PathRules
-from controlplane.core.problem.problem import BlockKey, FleetKey, Problem
-from protos.model.ids import Role
+from plr.controlplane.core.formulation.block import BlockNotes, Picture, draw_block, interfaces_of
+from plr.controlplane.core.policy.path_rules import PathRules
+from plr.controlplane.core.problem.problem import BlockKey, FleetKey, Problem
+from plr.protos.model.ids import Role
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
 
-    from controlplane.core.estimate.estimator import Estimator
-    from controlplane.core.policy.path_rules import PathRule
-    from controlplane.core.policy.permits import Group, Permits
-    from controlplane.core.problem.problem import Block, Objective
-    from controlplane.core.registry.registry import Sidecar
-    from protos.model.ids import InterfaceName, NodeName, ServiceName
-    from protos.model.members import InterfaceLabel, Registration, ServiceOffer, ServiceUse
-    from protos.model.report import Report
+    from plr.controlplane.core.estimate.estimator import Estimator
+    from plr.controlplane.core.policy.path_rules import PathRule
+    from plr.controlplane.core.policy.permits import Group, Permits
+    from plr.controlplane.core.problem.problem import Block, Objective
+    from plr.controlplane.core.registry.registry import Sidecar
+    from plr.protos.model.ids import InterfaceName, NodeName, ServiceName
+    from plr.protos.model.members import InterfaceLabel, Registration, ServiceOffer, ServiceUse
+    from plr.protos.model.report import Report
 
 SLICE_PAIRS = 40
 """Pairs (interface, server) estimated at a time: some milliseconds, for which streams wait."""

@@ -13,11 +13,11 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from controlplane.core.estimate.posterior import Estimate
-    from controlplane.core.problem.problem import Block
-    from controlplane.core.registry.registry import Sidecar
-    from protos.model.ids import InterfaceName, NodeName
-    from protos.model.members import ServiceUse
+    from plr.controlplane.core.estimate.posterior import Estimate
+    from plr.controlplane.core.problem.problem import Block
+    from plr.controlplane.core.registry.registry import Sidecar
+    from plr.protos.model.ids import InterfaceName, NodeName
+    from plr.protos.model.members import ServiceUse
 
 MAX_PLANNED = 8
 """Interfaces of one robot in one mapping: the maximum number of copies a robot sends of a request."""

@@ -7,8 +7,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from controlplane.core.base.member_table import MemberTable
-from protos.base.token_bucket import TokenBucket
+from plr.controlplane.core.base.member_table import MemberTable
+from plr.protos.base.token_bucket import TokenBucket
 
 LINES_BURST = 20.0
 """A day of somebody who looks for a mistake, in minutes."""

@@ -7,11 +7,11 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from controlplane.core.base.member_table import MemberTable
-from protos.base.token_bucket import TokenBucket
+from plr.controlplane.core.base.member_table import MemberTable
+from plr.protos.base.token_bucket import TokenBucket
 
 if TYPE_CHECKING:
-    from protos.model.ids import NodeName
+    from plr.protos.model.ids import NodeName
 
 STARTS_BURST = 30.0
 """A day of somebody who looks for a mistake, in minutes."""

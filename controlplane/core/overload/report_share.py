@@ -15,12 +15,12 @@ import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from controlplane.core.base.member_table import MemberTable
+from plr.controlplane.core.base.member_table import MemberTable
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from protos.model.ids import NodeName
+    from plr.protos.model.ids import NodeName
 
 ENTRIES_PER_S = 2000.0
 """Entries of reports, each some 40 us to take at most: a robot with 8 interfaces that calls 4 services on 16 servers

@@ -8,11 +8,11 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from controlplane.core.base.member_table import MemberTable
-from protos.base.token_bucket import TokenBucket
+from plr.controlplane.core.base.member_table import MemberTable
+from plr.protos.base.token_bucket import TokenBucket
 
 if TYPE_CHECKING:
-    from protos.model.ids import NodeName
+    from plr.protos.model.ids import NodeName
 
 PAIRS_BURST = 2000.0
 """Pairs (interface, server) of one robot that are drawn at once, those of all its services: a small robot's news some

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from protos.model.ids import Role
+from plr.protos.model.ids import Role
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
-    from controlplane.core.policy.permits import Permits
-    from controlplane.core.registry.registry import Sidecar
-    from protos.model.ids import NodeName
+    from plr.controlplane.core.policy.permits import Permits
+    from plr.controlplane.core.registry.registry import Sidecar
+    from plr.protos.model.ids import NodeName
 
 
 def cut_off(sidecars: Iterable[Sidecar], permits: Permits) -> frozenset[NodeName]:

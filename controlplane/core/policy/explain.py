@@ -6,14 +6,14 @@ from dataclasses import dataclass
 from itertools import islice
 from typing import TYPE_CHECKING
 
-from controlplane.core.policy.patterns import matches
-from controlplane.core.policy.policy import CallRule, OfferRule
+from plr.controlplane.core.policy.patterns import matches
+from plr.controlplane.core.policy.policy import CallRule, OfferRule
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from controlplane.core.policy.policy import Policy
-    from protos.model.ids import NodeName, ServiceName
+    from plr.controlplane.core.policy.policy import Policy
+    from plr.protos.model.ids import NodeName, ServiceName
 
 
 MAX_CLOSE = 5

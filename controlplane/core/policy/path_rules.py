@@ -9,12 +9,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from controlplane.core.policy.patterns import PatternIndex, matches
+from plr.controlplane.core.policy.patterns import PatternIndex, matches
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterable, Sequence
 
-    from protos.model.ids import InterfaceName, NodeName
+    from plr.protos.model.ids import InterfaceName, NodeName
 
 MAX_PATH_RULES = 1024
 """Maximum number of rules in the list."""

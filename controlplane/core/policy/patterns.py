@@ -38,7 +38,7 @@ class NameKind(enum.Enum):
 
 _State = tuple[tuple[frozenset[str], int], ...]
 _STATES: dict[NameKind, tuple[tuple[_State, ...], int]] = {
-    # Names that `protos.model.names` accepts, as automata: where each state leads by which characters. The last
+    # Names that `plr.protos.model.names` accepts, as automata: where each state leads by which characters. The last
     # accepts.
     NameKind.NODE: ((((_ALNUM, 1),), ((_ALNUM | frozenset("_.-"), 1),)), 1),
     # Printable ASCII except the slash.

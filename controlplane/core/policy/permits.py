@@ -8,14 +8,14 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from controlplane.core.policy.patterns import PatternIndex
-from controlplane.core.registry.registry import MAX_SIDECARS
-from protos.model.members import ALL_CALLS, NO_POLICY, CallPermit
+from plr.controlplane.core.policy.patterns import PatternIndex
+from plr.controlplane.core.registry.registry import MAX_SIDECARS
+from plr.protos.model.members import ALL_CALLS, NO_POLICY, CallPermit
 
 if TYPE_CHECKING:
-    from controlplane.core.policy.policy import Policy
-    from controlplane.core.registry.registry import Sidecar
-    from protos.model.ids import NodeName, ServiceName
+    from plr.controlplane.core.policy.policy import Policy
+    from plr.controlplane.core.registry.registry import Sidecar
+    from plr.protos.model.ids import NodeName, ServiceName
 
 MAX_GROUPED = 2 * MAX_SIDECARS
 """Robots whose group is kept; beyond that, all are computed again."""

@@ -12,11 +12,11 @@ import json
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from controlplane.core.policy.patterns import matches
-from protos.model.members import NO_POLICY
+from plr.controlplane.core.policy.patterns import matches
+from plr.protos.model.members import NO_POLICY
 
 if TYPE_CHECKING:
-    from protos.model.ids import NodeName, ServiceName
+    from plr.protos.model.ids import NodeName, ServiceName
 
 MAX_RULES = 1024
 """Maximum number of rules in one list."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from protos.model.ids import NodeName, ServiceName
+    from plr.protos.model.ids import NodeName, ServiceName
 
 MAX_TOLD = 1024
 """Services of one cloud that are reported: as many as it may offer at once. Further ones are only counted."""

@@ -5,14 +5,14 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
-from protos.model.ids import Role
+from plr.protos.model.ids import Role
 
 if TYPE_CHECKING:
-    from controlplane.core.policy.permits import Permits
-    from controlplane.core.registry.registry import Registry
-    from protos.model.ids import NodeName, ServiceName
-    from protos.model.members import CallPermit
-    from protos.model.report import Report
+    from plr.controlplane.core.policy.permits import Permits
+    from plr.controlplane.core.registry.registry import Registry
+    from plr.protos.model.ids import NodeName, ServiceName
+    from plr.protos.model.members import CallPermit
+    from plr.protos.model.report import Report
 
 
 def believable(report: Report, robot: NodeName, registry: Registry, permits: Permits) -> tuple[Report, int]:

@@ -22,14 +22,14 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from controlplane.core.problem.domains import violation_counts, violations
-from controlplane.core.problem.objectives import LEAST_POSITIVE, joint_miss, objective_cost, objective_costs
-from controlplane.core.problem.problem import Objective
+from plr.controlplane.core.problem.domains import violation_counts, violations
+from plr.controlplane.core.problem.objectives import LEAST_POSITIVE, joint_miss, objective_cost, objective_costs
+from plr.controlplane.core.problem.problem import Objective
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from controlplane.core.problem.problem import Block, Choice, Target
+    from plr.controlplane.core.problem.problem import Block, Choice, Target
 
     Floats = NDArray[np.float64]
 

@@ -13,14 +13,14 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from controlplane.core.problem.problem import crowding
+from plr.controlplane.core.problem.problem import crowding
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
 
     from numpy.typing import NDArray
 
-    from controlplane.core.problem.problem import Block, Choice
+    from plr.controlplane.core.problem.problem import Block, Choice
 
     Indices = NDArray[np.intp]
 

@@ -19,18 +19,18 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from controlplane.core.problem.objectives import PROBABILITY_FLOOR, joint_miss
-from protos.model.redundancy_mode import RedundancyMode
+from plr.controlplane.core.problem.objectives import PROBABILITY_FLOOR, joint_miss
+from plr.protos.model.redundancy_mode import RedundancyMode
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from numpy.typing import NDArray
 
-    from controlplane.core.problem.plan import BlockPlan
-    from controlplane.core.problem.problem import Block, Choice, Path
-    from protos.model.ids import InterfaceName, NodeName
-    from protos.model.members import ServiceUse
+    from plr.controlplane.core.problem.plan import BlockPlan
+    from plr.controlplane.core.problem.problem import Block, Choice, Path
+    from plr.protos.model.ids import InterfaceName, NodeName
+    from plr.protos.model.members import ServiceUse
 
     Pair = tuple[InterfaceName, NodeName]
 

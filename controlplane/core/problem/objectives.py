@@ -19,12 +19,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from controlplane.core.problem.problem import Objective
+from plr.controlplane.core.problem.problem import Objective
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from controlplane.core.problem.problem import Block, Choice
+    from plr.controlplane.core.problem.problem import Block, Choice
 
 PROBABILITY_FLOOR = 1e-9
 """Smaller probabilities and lifts count as this, so that their logarithms are finite: no posterior mean over less than

@@ -8,20 +8,20 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from controlplane.core.problem.costs import block_cost, charge, without_rules
-from controlplane.core.problem.domains import shared_domains
-from controlplane.core.problem.objectives import joint_miss
-from controlplane.core.problem.problem import block_excess, fleet_excess, is_valid
-from controlplane.core.problem.shortfall import shortfall
+from plr.controlplane.core.problem.costs import block_cost, charge, without_rules
+from plr.controlplane.core.problem.domains import shared_domains
+from plr.controlplane.core.problem.objectives import joint_miss
+from plr.controlplane.core.problem.problem import block_excess, fleet_excess, is_valid
+from plr.controlplane.core.problem.shortfall import shortfall
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
     from numpy.typing import NDArray
 
-    from controlplane.core.problem.problem import Block, BlockKey, Choice, FleetKey, Problem
-    from protos.model.ids import InterfaceName, NodeName
-    from protos.model.mapping import Assignment
+    from plr.controlplane.core.problem.problem import Block, BlockKey, Choice, FleetKey, Problem
+    from plr.protos.model.ids import InterfaceName, NodeName
+    from plr.protos.model.mapping import Assignment
 
 
 @dataclass(frozen=True, slots=True)

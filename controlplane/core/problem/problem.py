@@ -22,13 +22,13 @@ from collections import Counter
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, NamedTuple
 
-from controlplane.core.estimate.posterior import Estimate
-from protos.model.members import EVERY_INTERFACE, Copies
+from plr.controlplane.core.estimate.posterior import Estimate
+from plr.protos.model.members import EVERY_INTERFACE, Copies
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
 
-    from protos.model.ids import InterfaceName, NodeName, ServiceName
+    from plr.protos.model.ids import InterfaceName, NodeName, ServiceName
 
 
 class BlockKey(NamedTuple):

@@ -5,11 +5,11 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING
 
-from controlplane.core.problem.costs import meets
-from controlplane.core.problem.objectives import PROBABILITY_FLOOR, joint_miss
+from plr.controlplane.core.problem.costs import meets
+from plr.controlplane.core.problem.objectives import PROBABILITY_FLOOR, joint_miss
 
 if TYPE_CHECKING:
-    from controlplane.core.problem.problem import Block, Choice
+    from plr.controlplane.core.problem.problem import Block, Choice
 
 MAX_CARRIERS = 8
 """More carriers than this are no advice."""

@@ -6,11 +6,11 @@ from collections import OrderedDict, deque
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
-from controlplane.core.problem.problem import BlockKey
+from plr.controlplane.core.problem.problem import BlockKey
 
 if TYPE_CHECKING:
-    from protos.model.ids import NodeName, Version
-    from protos.model.mapping import MappingSet, ServiceMapping
+    from plr.protos.model.ids import NodeName, Version
+    from plr.protos.model.mapping import MappingSet, ServiceMapping
 
 MAX_CHANGES = 8
 """Changes remembered of one robot's service: two minutes of the maximum rate of changes for the better."""

@@ -4,21 +4,21 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from controlplane.core.formulation.block import interfaces_of
-from controlplane.core.formulation.surplus import MAX_PLANNED
-from controlplane.core.problem.mode_miss import predicted_miss
-from controlplane.core.problem.problem import BlockKey, Objective
-from protos.model.mapping import Assignment, ServiceMapping
-from protos.model.members import NO_CALLS
+from plr.controlplane.core.formulation.block import interfaces_of
+from plr.controlplane.core.formulation.surplus import MAX_PLANNED
+from plr.controlplane.core.problem.mode_miss import predicted_miss
+from plr.controlplane.core.problem.problem import BlockKey, Objective
+from plr.protos.model.mapping import Assignment, ServiceMapping
+from plr.protos.model.members import NO_CALLS
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Mapping
 
-    from controlplane.core.formulation.block import BlockNotes, Picture
-    from controlplane.core.problem.plan import BlockPlan, Plan
-    from controlplane.core.registry.registry import Sidecar
-    from protos.model.ids import InterfaceName, NodeName, ServiceName
-    from protos.model.members import CallPermit
+    from plr.controlplane.core.formulation.block import BlockNotes, Picture
+    from plr.controlplane.core.problem.plan import BlockPlan, Plan
+    from plr.controlplane.core.registry.registry import Sidecar
+    from plr.protos.model.ids import InterfaceName, NodeName, ServiceName
+    from plr.protos.model.members import CallPermit
 
 PREDICTION_CHANGE = 2.0
 """Factor by which a predicted miss probability alone must differ to be sent: it informs, nothing acts on it."""

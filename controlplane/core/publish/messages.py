@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from controlplane.core.registry.registry import StreamId
-    from protos.model.stream import ControlMessage
+    from plr.controlplane.core.registry.registry import StreamId
+    from plr.protos.model.stream import ControlMessage
 
 
 class CloseReason(enum.Enum):

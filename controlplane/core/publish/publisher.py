@@ -23,27 +23,27 @@ from __future__ import annotations
 from collections import OrderedDict
 from typing import TYPE_CHECKING
 
-from controlplane.core.publish import mappings
-from controlplane.core.publish.messages import Send
-from controlplane.core.publish.snapshots import PeerView, Snapshots, VersionSource
-from controlplane.core.publish.told_peers import ToldPeers
-from controlplane.core.publish.views import KnownPeers, Views
-from controlplane.core.registry.registry import MAX_SIDECARS
-from protos.model.ids import Role, Version
-from protos.model.members import POLICY_PENDING
-from protos.model.stream import ResourceKind
+from plr.controlplane.core.publish import mappings
+from plr.controlplane.core.publish.messages import Send
+from plr.controlplane.core.publish.snapshots import PeerView, Snapshots, VersionSource
+from plr.controlplane.core.publish.told_peers import ToldPeers
+from plr.controlplane.core.publish.views import KnownPeers, Views
+from plr.controlplane.core.registry.registry import MAX_SIDECARS
+from plr.protos.model.ids import Role, Version
+from plr.protos.model.members import POLICY_PENDING
+from plr.protos.model.stream import ResourceKind
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
 
-    from controlplane.core.formulation.block import Picture
-    from controlplane.core.policy.permits import Permits
-    from controlplane.core.problem.plan import Plan
-    from controlplane.core.registry.registry import Registry, Sidecar, StreamId
-    from protos.model.ids import NodeName
-    from protos.model.members import Registration
-    from protos.model.status import SyncState
-    from protos.model.stream import Ack, Nack
+    from plr.controlplane.core.formulation.block import Picture
+    from plr.controlplane.core.policy.permits import Permits
+    from plr.controlplane.core.problem.plan import Plan
+    from plr.controlplane.core.registry.registry import Registry, Sidecar, StreamId
+    from plr.protos.model.ids import NodeName
+    from plr.protos.model.members import Registration
+    from plr.protos.model.status import SyncState
+    from plr.protos.model.stream import Ack, Nack
 
 MAX_GONE_SNAPSHOTS = MAX_SIDECARS
 """Sidecars that left whose last set is remembered, for the notices when they return; the oldest are evicted."""

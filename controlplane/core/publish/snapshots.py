@@ -6,18 +6,18 @@ import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Generic, TypeVar
 
-from protos.model.ids import MAX_VERSION, Version
-from protos.model.mapping import MappingSet
-from protos.model.members import POLICY_PENDING, PeerSet
-from protos.model.status import ResourceStatus, SyncState
-from protos.model.stream import ResourceKind
+from plr.protos.model.ids import MAX_VERSION, Version
+from plr.protos.model.mapping import MappingSet
+from plr.protos.model.members import POLICY_PENDING, PeerSet
+from plr.protos.model.status import ResourceStatus, SyncState
+from plr.protos.model.stream import ResourceKind
 
 if TYPE_CHECKING:
-    from controlplane.core.publish.told_peers import ToldPeers
-    from protos.model.ids import NodeName
-    from protos.model.mapping import ServiceMapping
-    from protos.model.members import Peer, RemovedPeer
-    from protos.model.stream import Ack, Nack
+    from plr.controlplane.core.publish.told_peers import ToldPeers
+    from plr.protos.model.ids import NodeName
+    from plr.protos.model.mapping import ServiceMapping
+    from plr.protos.model.members import Peer, RemovedPeer
+    from plr.protos.model.stream import Ack, Nack
 
 C = TypeVar("C")
 

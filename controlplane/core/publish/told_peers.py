@@ -10,13 +10,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, overload
 
-from protos.trust.pair_token import pair_token
+from plr.protos.trust.pair_token import pair_token
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from protos.model.ids import NodeName, Role
-    from protos.model.members import Peer
+    from plr.protos.model.ids import NodeName, Role
+    from plr.protos.model.members import Peer
 
 
 class ToldPeers(Sequence["Peer"]):

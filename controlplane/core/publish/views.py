@@ -10,16 +10,16 @@ from __future__ import annotations
 import dataclasses
 from typing import TYPE_CHECKING
 
-from protos.model.ids import Role
-from protos.model.members import ALL_CALLS, RemovalReason, RemovedPeer
+from plr.protos.model.ids import Role
+from plr.protos.model.members import ALL_CALLS, RemovalReason, RemovedPeer
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Mapping
 
-    from controlplane.core.policy.permits import Group, Permits
-    from controlplane.core.registry.registry import Registry, Sidecar
-    from protos.model.ids import NodeName
-    from protos.model.members import CallPermit, Peer
+    from plr.controlplane.core.policy.permits import Group, Permits
+    from plr.controlplane.core.registry.registry import Registry, Sidecar
+    from plr.protos.model.ids import NodeName
+    from plr.protos.model.members import CallPermit, Peer
 
 
 MAX_PERMITS_KEPT = 64

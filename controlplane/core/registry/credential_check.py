@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from controlplane.core.registry.registry import Refusal
-from protos.base.errors import DecodeError
-from protos.trust.credential import decode_credential, verify
+from plr.controlplane.core.registry.registry import Refusal
+from plr.protos.base.errors import DecodeError
+from plr.protos.trust.credential import decode_credential, verify
 
 if TYPE_CHECKING:
-    from protos.model.members import Registration
-    from protos.trust.identity import Identity
+    from plr.protos.model.members import Registration
+    from plr.protos.trust.identity import Identity
 
 
 def check_claims(registration: Registration, identity: Identity, certificate: bytes) -> Refusal | None:

@@ -12,16 +12,16 @@ from collections import OrderedDict
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, NewType
 
-from controlplane.core.overload.postponed import Postponed
-from controlplane.core.overload.registration_share import RegistrationShare
-from protos.model.ids import NodeName, Role
-from protos.model.members import NO_REVOCATIONS, CandidateSet, Peer, Registration, RemovalReason, RevocationSet
+from plr.controlplane.core.overload.postponed import Postponed
+from plr.controlplane.core.overload.registration_share import RegistrationShare
+from plr.protos.model.ids import NodeName, Role
+from plr.protos.model.members import NO_REVOCATIONS, CandidateSet, Peer, Registration, RemovalReason, RevocationSet
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterator
 
-    from protos.model.ids import ServiceName, SessionId
-    from protos.model.members import Candidate, InterfaceLabel, ServiceOffer, ServiceSet, ServiceUse
+    from plr.protos.model.ids import ServiceName, SessionId
+    from plr.protos.model.members import Candidate, InterfaceLabel, ServiceOffer, ServiceSet, ServiceUse
 
 StreamId = NewType("StreamId", int)
 """Number of one stream, unique in one run of the control plane."""

@@ -9,15 +9,15 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from controlplane.core.base.member_table import MemberTable
-from protos.base.token_bucket import TokenBucket
+from plr.controlplane.core.base.member_table import MemberTable
+from plr.protos.base.token_bucket import TokenBucket
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection
 
-    from controlplane.core.registry.registry import StreamId
-    from protos.model.ids import NodeName
-    from protos.model.members import CandidateSet, ServiceSet
+    from plr.controlplane.core.registry.registry import StreamId
+    from plr.protos.model.ids import NodeName
+    from plr.protos.model.members import CandidateSet, ServiceSet
 
     Announcement = CandidateSet | ServiceSet
 

@@ -7,16 +7,16 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from controlplane.core.problem.costs import TARGET_TOLERANCE, block_cost
-from controlplane.core.problem.objectives import PROBABILITY_FLOOR, joint_miss
-from controlplane.core.problem.problem import Objective
+from plr.controlplane.core.problem.costs import TARGET_TOLERANCE, block_cost
+from plr.controlplane.core.problem.objectives import PROBABILITY_FLOOR, joint_miss
+from plr.controlplane.core.problem.problem import Objective
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
     from numpy.typing import NDArray
 
-    from controlplane.core.problem.problem import Block, Choice, Path
+    from plr.controlplane.core.problem.problem import Block, Choice, Path
 
 DRAWS = 128
 """Draws of every unknown epsilon: the resulting probability is accurate to 0.05."""

@@ -10,15 +10,15 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING, NamedTuple
 
-from controlplane.core.problem.plan import choice_of
-from protos.model.mapping import Assignment
+from plr.controlplane.core.problem.plan import choice_of
+from plr.protos.model.mapping import Assignment
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from controlplane.core.problem.plan import BlockPlan, Plan
-    from controlplane.core.problem.problem import Block, BlockKey, Choice, Problem
-    from protos.model.ids import InterfaceName, NodeName
+    from plr.controlplane.core.problem.plan import BlockPlan, Plan
+    from plr.controlplane.core.problem.problem import Block, BlockKey, Choice, Problem
+    from plr.protos.model.ids import InterfaceName, NodeName
 
 TRIALS = 6.0
 """What a robot that explores sends within half a minute or more."""

@@ -13,18 +13,18 @@ from collections import Counter, deque
 from dataclasses import replace
 from typing import TYPE_CHECKING, NamedTuple
 
-from controlplane.core.problem.costs import block_cost, charge
-from controlplane.core.problem.domains import violations
-from controlplane.core.problem.objectives import joint_miss, objective_cost
-from controlplane.core.problem.plan import choice_of, make_plan
-from controlplane.core.problem.problem import Objective, block_excess, limits_used
-from controlplane.core.settle.certainty import probability_better, probability_met
+from plr.controlplane.core.problem.costs import block_cost, charge
+from plr.controlplane.core.problem.domains import violations
+from plr.controlplane.core.problem.objectives import joint_miss, objective_cost
+from plr.controlplane.core.problem.plan import choice_of, make_plan
+from plr.controlplane.core.problem.problem import Objective, block_excess, limits_used
+from plr.controlplane.core.settle.certainty import probability_better, probability_met
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from controlplane.core.problem.plan import BlockPlan, Plan
-    from controlplane.core.problem.problem import Block, BlockKey, Choice, FleetKey, Problem
+    from plr.controlplane.core.problem.plan import BlockPlan, Plan
+    from plr.controlplane.core.problem.problem import Block, BlockKey, Choice, FleetKey, Problem
 
 IMPROVEMENT_SHARE = 0.1
 IMPROVEMENT_MIN = 0.002

@@ -17,10 +17,10 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from controlplane.core.problem.costs import choice_costs
-from controlplane.core.problem.domains import repeats
-from controlplane.core.problem.objectives import epsilon_matrix, path_costs
-from controlplane.core.solve.enumeration import (
+from plr.controlplane.core.problem.costs import choice_costs
+from plr.controlplane.core.problem.domains import repeats
+from plr.controlplane.core.problem.objectives import epsilon_matrix, path_costs
+from plr.controlplane.core.solve.enumeration import (
     OWN_EXCESS_PRICE,
     combinations,
     list_choices,
@@ -28,17 +28,17 @@ from controlplane.core.solve.enumeration import (
     own_excess,
     tried_of_each,
 )
-from controlplane.core.solve.matching import cheapest_matching
-from controlplane.core.solve.path_bound import PathBound, path_bound
+from plr.controlplane.core.solve.matching import cheapest_matching
+from plr.controlplane.core.solve.path_bound import PathBound, path_bound
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
 
     from numpy.typing import NDArray
 
-    from controlplane.core.problem.problem import Block, Choice, Objective
-    from controlplane.core.solve.enumeration import Near
-    from controlplane.core.solve.limits import Limits
+    from plr.controlplane.core.problem.problem import Block, Choice, Objective
+    from plr.controlplane.core.solve.enumeration import Near
+    from plr.controlplane.core.solve.limits import Limits
 
     Floats = NDArray[np.float64]
     Indices = NDArray[np.intp]

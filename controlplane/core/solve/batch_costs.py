@@ -10,17 +10,17 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from controlplane.core.problem.costs import RULE_PRICE
-from controlplane.core.problem.domains import beyond, chooses_interfaces, has_shared_regions, numbered, repeats
-from controlplane.core.problem.objectives import PROBABILITY_FLOOR, cost_of_none, epsilon_matrix, path_costs
-from controlplane.core.problem.problem import Objective
+from plr.controlplane.core.problem.costs import RULE_PRICE
+from plr.controlplane.core.problem.domains import beyond, chooses_interfaces, has_shared_regions, numbered, repeats
+from plr.controlplane.core.problem.objectives import PROBABILITY_FLOOR, cost_of_none, epsilon_matrix, path_costs
+from plr.controlplane.core.problem.problem import Objective
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from numpy.typing import NDArray
 
-    from controlplane.core.problem.problem import Block
+    from plr.controlplane.core.problem.problem import Block
 
     Floats = NDArray[np.float64]
     Indices = NDArray[np.intp]

@@ -18,22 +18,22 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from controlplane.core.problem.domains import chooses_interfaces, has_shared_regions
-from controlplane.core.problem.plan import relative_gap
-from controlplane.core.problem.problem import Objective
-from controlplane.core.solve.batch import EnumeratedStack, SeparableStack
-from controlplane.core.solve.enumeration import MAX_LISTED, OWN_EXCESS_PRICE
-from controlplane.core.solve.incumbent import Standing
-from controlplane.core.solve.pattern_batch import PatternStack
+from plr.controlplane.core.problem.domains import chooses_interfaces, has_shared_regions
+from plr.controlplane.core.problem.plan import relative_gap
+from plr.controlplane.core.problem.problem import Objective
+from plr.controlplane.core.solve.batch import EnumeratedStack, SeparableStack
+from plr.controlplane.core.solve.enumeration import MAX_LISTED, OWN_EXCESS_PRICE
+from plr.controlplane.core.solve.incumbent import Standing
+from plr.controlplane.core.solve.pattern_batch import PatternStack
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
 
     from numpy.typing import NDArray
 
-    from controlplane.core.problem.problem import Block, BlockKey, Choice, FleetKey, Problem
-    from controlplane.core.solve.batch import Best, Stack
-    from controlplane.core.solve.limits import Limits
+    from plr.controlplane.core.problem.problem import Block, BlockKey, Choice, FleetKey, Problem
+    from plr.controlplane.core.solve.batch import Best, Stack
+    from plr.controlplane.core.solve.limits import Limits
 
     Floats = NDArray[np.float64]
 

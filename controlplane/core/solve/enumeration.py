@@ -9,13 +9,13 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from controlplane.core.problem.domains import repeats
-from controlplane.core.problem.objectives import epsilon_matrix, log_lift
+from plr.controlplane.core.problem.domains import repeats
+from plr.controlplane.core.problem.objectives import epsilon_matrix, log_lift
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from controlplane.core.problem.problem import Block
+    from plr.controlplane.core.problem.problem import Block
 
     Floats = NDArray[np.float64]
     Indices = NDArray[np.intp]

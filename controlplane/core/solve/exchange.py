@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from controlplane.core.solve.incumbent import Standing
+    from plr.controlplane.core.solve.incumbent import Standing
 
     Floats = NDArray[np.float64]
     Indices = NDArray[np.intp]

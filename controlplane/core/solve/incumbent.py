@@ -11,20 +11,20 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from controlplane.core.problem.costs import block_cost
-from controlplane.core.problem.plan import size
-from controlplane.core.problem.problem import block_excess
-from controlplane.core.solve.exchange import trade
+from plr.controlplane.core.problem.costs import block_cost
+from plr.controlplane.core.problem.plan import size
+from plr.controlplane.core.problem.problem import block_excess
+from plr.controlplane.core.solve.exchange import trade
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
 
     from numpy.typing import NDArray
 
-    from controlplane.core.problem.problem import BlockKey, Choice, Objective
-    from controlplane.core.solve.batch import Best, Stack
-    from controlplane.core.solve.exchange import Move
-    from controlplane.core.solve.limits import Limits
+    from plr.controlplane.core.problem.problem import BlockKey, Choice, Objective
+    from plr.controlplane.core.solve.batch import Best, Stack
+    from plr.controlplane.core.solve.exchange import Move
+    from plr.controlplane.core.solve.limits import Limits
 
     Floats = NDArray[np.float64]
     Indices = NDArray[np.intp]

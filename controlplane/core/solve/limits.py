@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from controlplane.core.problem.problem import FleetKey
+from plr.controlplane.core.problem.problem import FleetKey
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from controlplane.core.problem.problem import Block, Problem
+    from plr.controlplane.core.problem.problem import Block, Problem
 
 
 class Limits:

@@ -10,14 +10,14 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from controlplane.core.problem.domains import repeats
-from controlplane.core.problem.objectives import epsilon_matrix
-from controlplane.core.problem.problem import reachable
+from plr.controlplane.core.problem.domains import repeats
+from plr.controlplane.core.problem.objectives import epsilon_matrix
+from plr.controlplane.core.problem.problem import reachable
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from controlplane.core.problem.problem import Block
+    from plr.controlplane.core.problem.problem import Block
 
 NO_PATH_COST = 1e12
 """Stands for infinity, which the method cannot subtract."""

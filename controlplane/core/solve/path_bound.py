@@ -7,16 +7,16 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from controlplane.core.problem.costs import RULE_PRICE, TARGET_FLOOR, TARGET_TOLERANCE, largest_charge
-from controlplane.core.problem.domains import least_violations
-from controlplane.core.problem.objectives import cost_of_none, epsilon_matrix, path_costs
-from controlplane.core.problem.problem import Objective
-from controlplane.core.solve.enumeration import lift_floor
+from plr.controlplane.core.problem.costs import RULE_PRICE, TARGET_FLOOR, TARGET_TOLERANCE, largest_charge
+from plr.controlplane.core.problem.domains import least_violations
+from plr.controlplane.core.problem.objectives import cost_of_none, epsilon_matrix, path_costs
+from plr.controlplane.core.problem.problem import Objective
+from plr.controlplane.core.solve.enumeration import lift_floor
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from controlplane.core.problem.problem import Block, Target
+    from plr.controlplane.core.problem.problem import Block, Target
 
     Floats = NDArray[np.float64]
 

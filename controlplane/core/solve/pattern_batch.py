@@ -14,10 +14,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from controlplane.core.problem.costs import RULE_PRICE
-from controlplane.core.solve.batch import Best, Stack
-from controlplane.core.solve.batch_costs import StackedCosts
-from controlplane.core.solve.enumeration import (
+from plr.controlplane.core.problem.costs import RULE_PRICE
+from plr.controlplane.core.solve.batch import Best, Stack
+from plr.controlplane.core.solve.batch_costs import StackedCosts
+from plr.controlplane.core.solve.enumeration import (
     MAX_LISTED,
     OWN_EXCESS_PRICE,
     TRIED_A_CHOICE,
@@ -25,17 +25,17 @@ from controlplane.core.solve.enumeration import (
     nearest,
     tried_of_each,
 )
-from controlplane.core.solve.matching import forced_excess
-from controlplane.core.solve.server_groups import ROWS_AT_ONCE, ServerGroups, violations
+from plr.controlplane.core.solve.matching import forced_excess
+from plr.controlplane.core.solve.server_groups import ROWS_AT_ONCE, ServerGroups, violations
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from numpy.typing import NDArray
 
-    from controlplane.core.problem.problem import Block, Objective
-    from controlplane.core.solve.enumeration import Near
-    from controlplane.core.solve.limits import Limits
+    from plr.controlplane.core.problem.problem import Block, Objective
+    from plr.controlplane.core.solve.enumeration import Near
+    from plr.controlplane.core.solve.limits import Limits
 
     Floats = NDArray[np.float64]
     Indices = NDArray[np.intp]

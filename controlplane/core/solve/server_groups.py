@@ -15,17 +15,17 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from controlplane.core.problem.domains import beyond, chooses_interfaces
-from controlplane.core.problem.objectives import log_lift
-from controlplane.core.solve.enumeration import combinations
+from plr.controlplane.core.problem.domains import beyond, chooses_interfaces
+from plr.controlplane.core.problem.objectives import log_lift
+from plr.controlplane.core.solve.enumeration import combinations
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from numpy.typing import NDArray
 
-    from controlplane.core.problem.problem import Block
-    from controlplane.core.solve.batch_costs import StackedCosts
+    from plr.controlplane.core.problem.problem import Block
+    from plr.controlplane.core.solve.batch_costs import StackedCosts
 
     Floats = NDArray[np.float64]
     Indices = NDArray[np.intp]

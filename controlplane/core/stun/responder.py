@@ -11,12 +11,12 @@ import enum
 from collections import Counter
 from typing import TYPE_CHECKING
 
-from controlplane.core.stun.source_limits import SourceLimits
-from protos.base.errors import DecodeError
-from protos.stun.codec import MessageClass, StunMessage, decode, encode, is_stun
+from plr.controlplane.core.stun.source_limits import SourceLimits
+from plr.protos.base.errors import DecodeError
+from plr.protos.stun.codec import MessageClass, StunMessage, decode, encode, is_stun
 
 if TYPE_CHECKING:
-    from protos.model.ids import Address
+    from plr.protos.model.ids import Address
 
 UNKNOWN_ATTRIBUTE_CODE = 420
 

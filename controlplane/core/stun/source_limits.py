@@ -10,10 +10,10 @@ from collections import OrderedDict
 from ipaddress import IPv6Address
 from typing import TYPE_CHECKING
 
-from protos.base.token_bucket import TokenBucket
+from plr.protos.base.token_bucket import TokenBucket
 
 if TYPE_CHECKING:
-    from protos.model.ids import Address
+    from plr.protos.model.ids import Address
 
 ANSWERS_PER_S = 50.0
 """Rate to one source: a hundred robots behind one carrier's NAT, each asking every few seconds."""

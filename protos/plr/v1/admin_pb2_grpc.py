@@ -3,7 +3,7 @@
 import grpc
 import warnings
 
-from protos.plr.v1 import admin_pb2 as protos_dot_plr_dot_v1_dot_admin__pb2
+from plr.protos.plr.v1 import admin_pb2 as plr_dot_protos_dot_plr_dot_v1_dot_admin__pb2
 
 GRPC_GENERATED_VERSION = '1.81.1'
 GRPC_VERSION = grpc.__version__
@@ -18,7 +18,7 @@ except ImportError:
 if _version_not_supported:
     raise RuntimeError(
         f'The grpc package installed is at version {GRPC_VERSION},'
-        + ' but the generated code in protos/plr/v1/admin_pb2_grpc.py depends on'
+        + ' but the generated code in plr/protos/plr/v1/admin_pb2_grpc.py depends on'
         + f' grpcio>={GRPC_GENERATED_VERSION}.'
         + f' Please upgrade your grpc module to grpcio>={GRPC_GENERATED_VERSION}'
         + f' or downgrade your generated code using grpcio-tools<={GRPC_VERSION}.'
@@ -37,23 +37,23 @@ class AdminStub:
         """
         self.GetStatus = channel.unary_unary(
                 '/plr.v1.Admin/GetStatus',
-                request_serializer=protos_dot_plr_dot_v1_dot_admin__pb2.GetStatusRequest.SerializeToString,
-                response_deserializer=protos_dot_plr_dot_v1_dot_admin__pb2.GetStatusResponse.FromString,
+                request_serializer=plr_dot_protos_dot_plr_dot_v1_dot_admin__pb2.GetStatusRequest.SerializeToString,
+                response_deserializer=plr_dot_protos_dot_plr_dot_v1_dot_admin__pb2.GetStatusResponse.FromString,
                 _registered_method=True)
         self.StreamStatus = channel.unary_stream(
                 '/plr.v1.Admin/StreamStatus',
-                request_serializer=protos_dot_plr_dot_v1_dot_admin__pb2.StreamStatusRequest.SerializeToString,
-                response_deserializer=protos_dot_plr_dot_v1_dot_admin__pb2.GetStatusResponse.FromString,
+                request_serializer=plr_dot_protos_dot_plr_dot_v1_dot_admin__pb2.StreamStatusRequest.SerializeToString,
+                response_deserializer=plr_dot_protos_dot_plr_dot_v1_dot_admin__pb2.GetStatusResponse.FromString,
                 _registered_method=True)
         self.Explain = channel.unary_unary(
                 '/plr.v1.Admin/Explain',
-                request_serializer=protos_dot_plr_dot_v1_dot_admin__pb2.ExplainRequest.SerializeToString,
-                response_deserializer=protos_dot_plr_dot_v1_dot_admin__pb2.ExplainResponse.FromString,
+                request_serializer=plr_dot_protos_dot_plr_dot_v1_dot_admin__pb2.ExplainRequest.SerializeToString,
+                response_deserializer=plr_dot_protos_dot_plr_dot_v1_dot_admin__pb2.ExplainResponse.FromString,
                 _registered_method=True)
         self.ListEvents = channel.unary_unary(
                 '/plr.v1.Admin/ListEvents',
-                request_serializer=protos_dot_plr_dot_v1_dot_admin__pb2.ListEventsRequest.SerializeToString,
-                response_deserializer=protos_dot_plr_dot_v1_dot_admin__pb2.ListEventsResponse.FromString,
+                request_serializer=plr_dot_protos_dot_plr_dot_v1_dot_admin__pb2.ListEventsRequest.SerializeToString,
+                response_deserializer=plr_dot_protos_dot_plr_dot_v1_dot_admin__pb2.ListEventsResponse.FromString,
                 _registered_method=True)
 
 
@@ -95,23 +95,23 @@ def add_AdminServicer_to_server(servicer, server):
     rpc_method_handlers = {
             'GetStatus': grpc.unary_unary_rpc_method_handler(
                     servicer.GetStatus,
-                    request_deserializer=protos_dot_plr_dot_v1_dot_admin__pb2.GetStatusRequest.FromString,
-                    response_serializer=protos_dot_plr_dot_v1_dot_admin__pb2.GetStatusResponse.SerializeToString,
+                    request_deserializer=plr_dot_protos_dot_plr_dot_v1_dot_admin__pb2.GetStatusRequest.FromString,
+                    response_serializer=plr_dot_protos_dot_plr_dot_v1_dot_admin__pb2.GetStatusResponse.SerializeToString,
             ),
             'StreamStatus': grpc.unary_stream_rpc_method_handler(
                     servicer.StreamStatus,
-                    request_deserializer=protos_dot_plr_dot_v1_dot_admin__pb2.StreamStatusRequest.FromString,
-                    response_serializer=protos_dot_plr_dot_v1_dot_admin__pb2.GetStatusResponse.SerializeToString,
+                    request_deserializer=plr_dot_protos_dot_plr_dot_v1_dot_admin__pb2.StreamStatusRequest.FromString,
+                    response_serializer=plr_dot_protos_dot_plr_dot_v1_dot_admin__pb2.GetStatusResponse.SerializeToString,
             ),
             'Explain': grpc.unary_unary_rpc_method_handler(
                     servicer.Explain,
-                    request_deserializer=protos_dot_plr_dot_v1_dot_admin__pb2.ExplainRequest.FromString,
-                    response_serializer=protos_dot_plr_dot_v1_dot_admin__pb2.ExplainResponse.SerializeToString,
+                    request_deserializer=plr_dot_protos_dot_plr_dot_v1_dot_admin__pb2.ExplainRequest.FromString,
+                    response_serializer=plr_dot_protos_dot_plr_dot_v1_dot_admin__pb2.ExplainResponse.SerializeToString,
             ),
             'ListEvents': grpc.unary_unary_rpc_method_handler(
                     servicer.ListEvents,
-                    request_deserializer=protos_dot_plr_dot_v1_dot_admin__pb2.ListEventsRequest.FromString,
-                    response_serializer=protos_dot_plr_dot_v1_dot_admin__pb2.ListEventsResponse.SerializeToString,
+                    request_deserializer=plr_dot_protos_dot_plr_dot_v1_dot_admin__pb2.ListEventsRequest.FromString,
+                    response_serializer=plr_dot_protos_dot_plr_dot_v1_dot_admin__pb2.ListEventsResponse.SerializeToString,
             ),
     }
     generic_handler = grpc.method_handlers_generic_handler(
@@ -140,8 +140,8 @@ class Admin:
             request,
             target,
             '/plr.v1.Admin/GetStatus',
-            protos_dot_plr_dot_v1_dot_admin__pb2.GetStatusRequest.SerializeToString,
-            protos_dot_plr_dot_v1_dot_admin__pb2.GetStatusResponse.FromString,
+            plr_dot_protos_dot_plr_dot_v1_dot_admin__pb2.GetStatusRequest.SerializeToString,
+            plr_dot_protos_dot_plr_dot_v1_dot_admin__pb2.GetStatusResponse.FromString,
             options,
             channel_credentials,
             insecure,
@@ -167,8 +167,8 @@ class Admin:
             request,
             target,
             '/plr.v1.Admin/StreamStatus',
-            protos_dot_plr_dot_v1_dot_admin__pb2.StreamStatusRequest.SerializeToString,
-            protos_dot_plr_dot_v1_dot_admin__pb2.GetStatusResponse.FromString,
+            plr_dot_protos_dot_plr_dot_v1_dot_admin__pb2.StreamStatusRequest.SerializeToString,
+            plr_dot_protos_dot_plr_dot_v1_dot_admin__pb2.GetStatusResponse.FromString,
             options,
             channel_credentials,
             insecure,
@@ -194,8 +194,8 @@ class Admin:
             request,
             target,
             '/plr.v1.Admin/Explain',
-            protos_dot_plr_dot_v1_dot_admin__pb2.ExplainRequest.SerializeToString,
-            protos_dot_plr_dot_v1_dot_admin__pb2.ExplainResponse.FromString,
+            plr_dot_protos_dot_plr_dot_v1_dot_admin__pb2.ExplainRequest.SerializeToString,
+            plr_dot_protos_dot_plr_dot_v1_dot_admin__pb2.ExplainResponse.FromString,
             options,
             channel_credentials,
             insecure,
@@ -221,8 +221,8 @@ class Admin:
             request,
             target,
             '/plr.v1.Admin/ListEvents',
-            protos_dot_plr_dot_v1_dot_admin__pb2.ListEventsRequest.SerializeToString,
-            protos_dot_plr_dot_v1_dot_admin__pb2.ListEventsResponse.FromString,
+            plr_dot_protos_dot_plr_dot_v1_dot_admin__pb2.ListEventsRequest.SerializeToString,
+            plr_dot_protos_dot_plr_dot_v1_dot_admin__pb2.ListEventsResponse.FromString,
             options,
             channel_credentials,
             insecure,

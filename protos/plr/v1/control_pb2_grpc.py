@@ -3,7 +3,7 @@
 import grpc
 import warnings
 
-from protos.plr.v1 import control_pb2 as protos_dot_plr_dot_v1_dot_control__pb2
+from plr.protos.plr.v1 import control_pb2 as plr_dot_protos_dot_plr_dot_v1_dot_control__pb2
 
 GRPC_GENERATED_VERSION = '1.81.1'
 GRPC_VERSION = grpc.__version__
@@ -18,7 +18,7 @@ except ImportError:
 if _version_not_supported:
     raise RuntimeError(
         f'The grpc package installed is at version {GRPC_VERSION},'
-        + ' but the generated code in protos/plr/v1/control_pb2_grpc.py depends on'
+        + ' but the generated code in plr/protos/plr/v1/control_pb2_grpc.py depends on'
         + f' grpcio>={GRPC_GENERATED_VERSION}.'
         + f' Please upgrade your grpc module to grpcio>={GRPC_GENERATED_VERSION}'
         + f' or downgrade your generated code using grpcio-tools<={GRPC_VERSION}.'
@@ -44,8 +44,8 @@ class ControlPlaneStub:
         """
         self.Connect = channel.stream_stream(
                 '/plr.v1.ControlPlane/Connect',
-                request_serializer=protos_dot_plr_dot_v1_dot_control__pb2.SidecarMessage.SerializeToString,
-                response_deserializer=protos_dot_plr_dot_v1_dot_control__pb2.ControlMessage.FromString,
+                request_serializer=plr_dot_protos_dot_plr_dot_v1_dot_control__pb2.SidecarMessage.SerializeToString,
+                response_deserializer=plr_dot_protos_dot_plr_dot_v1_dot_control__pb2.ControlMessage.FromString,
                 _registered_method=True)
 
 
@@ -71,8 +71,8 @@ def add_ControlPlaneServicer_to_server(servicer, server):
     rpc_method_handlers = {
             'Connect': grpc.stream_stream_rpc_method_handler(
                     servicer.Connect,
-                    request_deserializer=protos_dot_plr_dot_v1_dot_control__pb2.SidecarMessage.FromString,
-                    response_serializer=protos_dot_plr_dot_v1_dot_control__pb2.ControlMessage.SerializeToString,
+                    request_deserializer=plr_dot_protos_dot_plr_dot_v1_dot_control__pb2.SidecarMessage.FromString,
+                    response_serializer=plr_dot_protos_dot_plr_dot_v1_dot_control__pb2.ControlMessage.SerializeToString,
             ),
     }
     generic_handler = grpc.method_handlers_generic_handler(
@@ -108,8 +108,8 @@ class ControlPlane:
             request_iterator,
             target,
             '/plr.v1.ControlPlane/Connect',
-            protos_dot_plr_dot_v1_dot_control__pb2.SidecarMessage.SerializeToString,
-            protos_dot_plr_dot_v1_dot_control__pb2.ControlMessage.FromString,
+            plr_dot_protos_dot_plr_dot_v1_dot_control__pb2.SidecarMessage.SerializeToString,
+            plr_dot_protos_dot_plr_dot_v1_dot_control__pb2.ControlMessage.FromString,
             options,
             channel_credentials,
             insecure,

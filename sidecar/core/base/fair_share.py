@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from protos.model.ids import NodeName
+    from plr.protos.model.ids import NodeName
 
 FORGOTTEN_AT_ONCE = 128
 """Old entries that a table forgets in one call; the rest waits for the next: under a millisecond after any burst."""

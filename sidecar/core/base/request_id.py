@@ -10,10 +10,10 @@ from __future__ import annotations
 import hashlib
 from typing import TYPE_CHECKING
 
-from sidecar.core.base.values import RequestId
+from plr.sidecar.core.base.values import RequestId
 
 if TYPE_CHECKING:
-    from protos.model.ids import SessionId
+    from plr.protos.model.ids import SessionId
 
 REQUEST_ID_BYTES = 16
 OBSERVED_ONE_IN = 8

@@ -6,7 +6,7 @@ import enum
 from typing import TYPE_CHECKING, NamedTuple, NewType
 
 if TYPE_CHECKING:
-    from protos.model.ids import InterfaceId, InterfaceName, NodeName
+    from plr.protos.model.ids import InterfaceId, InterfaceName, NodeName
 
 RequestId = NewType("RequestId", bytes)
 """16 bytes that name one request forever; see `request_id.py`."""

@@ -9,8 +9,8 @@ from collections import OrderedDict
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from protos.model.ids import NodeName
-    from sidecar.core.base.values import RequestId
+    from plr.protos.model.ids import NodeName
+    from plr.sidecar.core.base.values import RequestId
 
 
 class AnswerCache:

@@ -17,28 +17,28 @@ from functools import partial
 from itertools import chain, count, islice
 from typing import TYPE_CHECKING
 
-from sidecar.core.base.fair_share import Shares
-from sidecar.core.base.request_id import is_race
-from sidecar.core.base.slices import in_groups
-from sidecar.core.base.timers import first_of
-from sidecar.core.base.values import PathState, Priority, RejectReason
-from sidecar.core.cloud.executions import Waiter
-from sidecar.core.transfer.room import Lane
-from sidecar.core.transfer.waiting_line import WaitingLine
-from sidecar.core.wire.messages import RejectionMessage, ResponseMessage, encode_message
+from plr.sidecar.core.base.fair_share import Shares
+from plr.sidecar.core.base.request_id import is_race
+from plr.sidecar.core.base.slices import in_groups
+from plr.sidecar.core.base.timers import first_of
+from plr.sidecar.core.base.values import PathState, Priority, RejectReason
+from plr.sidecar.core.cloud.executions import Waiter
+from plr.sidecar.core.transfer.room import Lane
+from plr.sidecar.core.transfer.waiting_line import WaitingLine
+from plr.sidecar.core.wire.messages import RejectionMessage, ResponseMessage, encode_message
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterable, Iterator
 
-    from protos.model.ids import NodeName
-    from sidecar.core.base.slices import Backlog, Step
-    from sidecar.core.base.values import PathId, RequestId
-    from sidecar.core.cloud.executions import Reply
-    from sidecar.core.message.outbound import OutboundMessage
-    from sidecar.core.rules.service_rule import Rules
-    from sidecar.core.seam.stats import EngineStats
-    from sidecar.core.transfer.outbox import Outbox
-    from sidecar.core.transfer.routes import Routes
+    from plr.protos.model.ids import NodeName
+    from plr.sidecar.core.base.slices import Backlog, Step
+    from plr.sidecar.core.base.values import PathId, RequestId
+    from plr.sidecar.core.cloud.executions import Reply
+    from plr.sidecar.core.message.outbound import OutboundMessage
+    from plr.sidecar.core.rules.service_rule import Rules
+    from plr.sidecar.core.seam.stats import EngineStats
+    from plr.sidecar.core.transfer.outbox import Outbox
+    from plr.sidecar.core.transfer.routes import Routes
 
 MAX_ANSWERS = 32_768
 """Most answers and rejections waiting or under way; one robot may have half: twice what it may have in flight."""

@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections import OrderedDict
 from typing import TYPE_CHECKING
 
-from sidecar.core.base.fair_share import FORGOTTEN_AT_ONCE, Shares
+from plr.sidecar.core.base.fair_share import FORGOTTEN_AT_ONCE, Shares
 
 if TYPE_CHECKING:
-    from protos.model.ids import NodeName
-    from sidecar.core.base.values import RequestId
-    from sidecar.core.seam.stats import EngineStats
+    from plr.protos.model.ids import NodeName
+    from plr.sidecar.core.base.values import RequestId
+    from plr.sidecar.core.seam.stats import EngineStats
 
 MAX_EARLY_CANCELS = 16_384
 """Ids kept; one robot may fill half: 130 requests a second, all overtaken by their cancels, for REMEMBER_CANCEL_S. A

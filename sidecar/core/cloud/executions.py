@@ -18,24 +18,24 @@ import heapq
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, NamedTuple
 
-from sidecar.core.base.fair_share import FORGOTTEN_AT_ONCE, Shares
-from sidecar.core.base.timers import first_of
-from sidecar.core.base.values import ExecutionId, RejectReason, RequestId
-from sidecar.core.cloud.answer_cache import AnswerCache
-from sidecar.core.cloud.early_cancels import EarlyCancels
-from sidecar.core.cloud.refused_copies import RefusedCopies, RefusedCopy
-from sidecar.core.rules.service_rule import MAX_LIFETIME_S
-from sidecar.core.seam.application import AbandonExecution, CancelExecution, ExecuteRequest
-from sidecar.core.wire.messages import MAX_PAYLOAD_BYTES, RejectionMessage, ResponseMessage
+from plr.sidecar.core.base.fair_share import FORGOTTEN_AT_ONCE, Shares
+from plr.sidecar.core.base.timers import first_of
+from plr.sidecar.core.base.values import ExecutionId, RejectReason, RequestId
+from plr.sidecar.core.cloud.answer_cache import AnswerCache
+from plr.sidecar.core.cloud.early_cancels import EarlyCancels
+from plr.sidecar.core.cloud.refused_copies import RefusedCopies, RefusedCopy
+from plr.sidecar.core.rules.service_rule import MAX_LIFETIME_S
+from plr.sidecar.core.seam.application import AbandonExecution, CancelExecution, ExecuteRequest
+from plr.sidecar.core.wire.messages import MAX_PAYLOAD_BYTES, RejectionMessage, ResponseMessage
 
 if TYPE_CHECKING:
     from collections.abc import Collection
 
-    from protos.model.ids import NodeName, ServiceName
-    from sidecar.core.base.slices import Backlog
-    from sidecar.core.base.values import PathId, Priority
-    from sidecar.core.seam.stats import EngineStats
-    from sidecar.core.wire.messages import RequestMessage
+    from plr.protos.model.ids import NodeName, ServiceName
+    from plr.sidecar.core.base.slices import Backlog
+    from plr.sidecar.core.base.values import PathId, Priority
+    from plr.sidecar.core.seam.stats import EngineStats
+    from plr.sidecar.core.wire.messages import RequestMessage
 
 MAX_RUNNING = 8192
 """Most requests that local servers work on at once."""

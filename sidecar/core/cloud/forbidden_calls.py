@@ -5,10 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from sidecar.core.seam.application import CallsForbidden
+from plr.sidecar.core.seam.application import CallsForbidden
 
 if TYPE_CHECKING:
-    from protos.model.ids import NodeName, ServiceName
+    from plr.protos.model.ids import NodeName, ServiceName
 
 TELL_EVERY_S = 10.0
 """Least time between two notices about one robot."""

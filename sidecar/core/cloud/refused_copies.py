@@ -10,12 +10,12 @@ from __future__ import annotations
 import heapq
 from typing import TYPE_CHECKING, NamedTuple
 
-from sidecar.core.base.fair_share import FORGOTTEN_AT_ONCE, Shares
+from plr.sidecar.core.base.fair_share import FORGOTTEN_AT_ONCE, Shares
 
 if TYPE_CHECKING:
-    from protos.model.ids import NodeName
-    from sidecar.core.base.values import RejectReason, RequestId
-    from sidecar.core.seam.stats import EngineStats
+    from plr.protos.model.ids import NodeName
+    from plr.sidecar.core.base.values import RejectReason, RequestId
+    from plr.sidecar.core.seam.stats import EngineStats
 
 MAX_REFUSED_COPIES = 65_536
 """Copies remembered; one robot may fill half: 500 refused copies a second for a minute. A copy that is not remembered

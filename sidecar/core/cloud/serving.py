@@ -7,26 +7,26 @@ from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING
 
-from sidecar.core.base.slices import in_groups
-from sidecar.core.base.values import RejectReason
-from sidecar.core.cloud.answers import Answers
-from sidecar.core.cloud.executions import ExecutionTable, Reply, Waiter
-from sidecar.core.cloud.forbidden_calls import ForbiddenCalls
-from sidecar.core.rules.service_rule import MAX_LIFETIME_S, Rules
-from sidecar.core.seam.application import ExecuteRequest
+from plr.sidecar.core.base.slices import in_groups
+from plr.sidecar.core.base.values import RejectReason
+from plr.sidecar.core.cloud.answers import Answers
+from plr.sidecar.core.cloud.executions import ExecutionTable, Reply, Waiter
+from plr.sidecar.core.cloud.forbidden_calls import ForbiddenCalls
+from plr.sidecar.core.rules.service_rule import MAX_LIFETIME_S, Rules
+from plr.sidecar.core.seam.application import ExecuteRequest
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Iterable
 
-    from protos.model.ids import NodeName, ServiceName
-    from protos.model.members import ServiceOffer
-    from sidecar.core.base.slices import Backlog, Step
-    from sidecar.core.base.values import ExecutionId, PathId, RequestId
-    from sidecar.core.seam.application import ApplicationEvent
-    from sidecar.core.seam.stats import EngineStats
-    from sidecar.core.transfer.outbox import Outbox
-    from sidecar.core.transfer.routes import Routes
-    from sidecar.core.wire.messages import CancelMessage, RequestMessage
+    from plr.protos.model.ids import NodeName, ServiceName
+    from plr.protos.model.members import ServiceOffer
+    from plr.sidecar.core.base.slices import Backlog, Step
+    from plr.sidecar.core.base.values import ExecutionId, PathId, RequestId
+    from plr.sidecar.core.seam.application import ApplicationEvent
+    from plr.sidecar.core.seam.stats import EngineStats
+    from plr.sidecar.core.transfer.outbox import Outbox
+    from plr.sidecar.core.transfer.routes import Routes
+    from plr.sidecar.core.wire.messages import CancelMessage, RequestMessage
 
 
 @dataclass(frozen=True, slots=True)

@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections import Counter
 from dataclasses import replace
 
-from protos.model.ids import Version
-from protos.model.members import MAX_PEERS, PeerSet
-from protos.model.peer_changes import put_upon
+from plr.protos.model.ids import Version
+from plr.protos.model.members import MAX_PEERS, PeerSet
+from plr.protos.model.peer_changes import put_upon
 
 
 class PeerAssembly:

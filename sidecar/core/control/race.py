@@ -9,12 +9,12 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from sidecar.core.control.ways import STAGGER_S
+from plr.sidecar.core.control.ways import STAGGER_S
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Sequence
 
-    from sidecar.core.control.ways import Way, WayClass
+    from plr.sidecar.core.control.ways import Way, WayClass
 
 
 class ControlRace:

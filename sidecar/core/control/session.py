@@ -19,20 +19,20 @@ from collections import Counter
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
-from protos.model.ids import Version
-from protos.model.mapping import MappingSet
-from protos.model.members import NO_REVOCATIONS, CandidateSet, PeerSet, RevocationSet, ServiceSet
-from protos.model.report import Report
-from protos.model.stream import Ack, Drain, Heartbeat, Nack, ResourceKind, Welcome
-from sidecar.core.base.report_scope import ReportScope
-from sidecar.core.control.backoff import Backoff
-from sidecar.core.control.peer_assembly import PeerAssembly
+from plr.protos.model.ids import Version
+from plr.protos.model.mapping import MappingSet
+from plr.protos.model.members import NO_REVOCATIONS, CandidateSet, PeerSet, RevocationSet, ServiceSet
+from plr.protos.model.report import Report
+from plr.protos.model.stream import Ack, Drain, Heartbeat, Nack, ResourceKind, Welcome
+from plr.sidecar.core.base.report_scope import ReportScope
+from plr.sidecar.core.control.backoff import Backoff
+from plr.sidecar.core.control.peer_assembly import PeerAssembly
 
 if TYPE_CHECKING:
     import random
 
-    from protos.model.members import Registration
-    from protos.model.stream import ControlMessage, SidecarMessage
+    from plr.protos.model.members import Registration
+    from plr.protos.model.stream import ControlMessage, SidecarMessage
 
 RETRY_FIRST_S = 0.2
 """First bound of the delay before a new stream: a restarted control plane is back within about a second."""

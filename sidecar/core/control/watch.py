@@ -13,11 +13,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from sidecar.core.control.ways import Life
+from plr.sidecar.core.control.ways import Life
 
 if TYPE_CHECKING:
-    from protos.model.ids import InterfaceName
-    from sidecar.core.control.ways import ControlWays, Way
+    from plr.protos.model.ids import InterfaceName
+    from plr.sidecar.core.control.ways import ControlWays, Way
 
 SILENT_S = 1.0
 """Time without acknowledgement to leave after, while the data plane hears somebody over another interface."""

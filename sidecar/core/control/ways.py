@@ -15,13 +15,13 @@ from dataclasses import dataclass, field
 from ipaddress import ip_address
 from typing import TYPE_CHECKING, NamedTuple
 
-from sidecar.core.base.values import PathState
+from plr.sidecar.core.base.values import PathState
 
 if TYPE_CHECKING:
     from collections import Counter
     from collections.abc import Iterable, Mapping, Sequence
 
-    from protos.model.ids import Address, InterfaceName
+    from plr.protos.model.ids import Address, InterfaceName
 
 MAX_STATES = 256
 """Interfaces whose history is remembered, as many as the data plane has numbers for."""

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Protocol
 
 from cryptography.hazmat.primitives.ciphers.aead import AESGCM, ChaCha20Poly1305
 
-from protos.trust.credential import Aead
+from plr.protos.trust.credential import Aead
 
 if TYPE_CHECKING:
     from cryptography.utils import Buffer

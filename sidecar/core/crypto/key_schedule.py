@@ -24,13 +24,13 @@ from typing import TYPE_CHECKING
 from cryptography.hazmat.primitives.hashes import SHA256
 from cryptography.hazmat.primitives.kdf.hkdf import HKDF, HKDFExpand
 
-from sidecar.core.crypto.aead import KEY_BYTES, choose
+from plr.sidecar.core.crypto.aead import KEY_BYTES, choose
 
 if TYPE_CHECKING:
     from cryptography.hazmat.primitives.asymmetric.x25519 import X25519PrivateKey, X25519PublicKey
 
-    from protos.model.ids import InterfaceId
-    from protos.trust.credential import Aead, SessionCredential
+    from plr.protos.model.ids import InterfaceId
+    from plr.protos.trust.credential import Aead, SessionCredential
 
 _PAIR = b"plr 2 pair"
 _PATH = b"plr 3 path"

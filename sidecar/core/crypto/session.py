@@ -7,19 +7,19 @@ from typing import TYPE_CHECKING
 
 from cryptography.hazmat.primitives.asymmetric.x25519 import X25519PrivateKey, X25519PublicKey
 
-from protos.base.errors import DecodeError
-from protos.model.ids import SessionId
-from protos.model.members import Candidate
-from protos.trust.candidate_signature import verify_candidates
-from protos.trust.credential import SessionCredential, decode_credential
-from protos.trust.identity import CertificateError
-from sidecar.core.crypto.key_schedule import pair_keys
+from plr.protos.base.errors import DecodeError
+from plr.protos.model.ids import SessionId
+from plr.protos.model.members import Candidate
+from plr.protos.trust.candidate_signature import verify_candidates
+from plr.protos.trust.credential import SessionCredential, decode_credential
+from plr.protos.trust.identity import CertificateError
+from plr.sidecar.core.crypto.key_schedule import pair_keys
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from protos.model.members import Peer
-    from sidecar.core.crypto.key_schedule import PairKeys
+    from plr.protos.model.members import Peer
+    from plr.sidecar.core.crypto.key_schedule import PairKeys
 
 MAX_ADMITTED = 8192
 """Credentials, and signed lists of addresses, whose verification is remembered; beyond it all are verified again."""

@@ -11,14 +11,14 @@ from __future__ import annotations
 from collections import Counter, OrderedDict
 from typing import TYPE_CHECKING, NamedTuple
 
-from protos.base.errors import DecodeError
-from protos.model.members import MAX_CANDIDATES_OF_INTERFACE
-from protos.trust.identity import REVOKED, CertificateError
+from plr.protos.base.errors import DecodeError
+from plr.protos.model.members import MAX_CANDIDATES_OF_INTERFACE
+from plr.protos.trust.identity import REVOKED, CertificateError
 
 if TYPE_CHECKING:
-    from protos.model.ids import InterfaceId, NodeName
-    from protos.model.members import Candidate, Peer
-    from sidecar.core.crypto.session import OwnSession
+    from plr.protos.model.ids import InterfaceId, NodeName
+    from plr.protos.model.members import Candidate, Peer
+    from plr.sidecar.core.crypto.session import OwnSession
 
 MAX_REMEMBERED = 8192
 """Peers whose newest announcement is remembered; twice those of a view, so that the absent ones are forgotten."""

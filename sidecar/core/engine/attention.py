@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from protos.model.ids import NodeName
+    from plr.protos.model.ids import NodeName
 
 ATTEND_EVERY_S = 0.5
 """While requests come, links are told this often: as often as a path in use is probed."""

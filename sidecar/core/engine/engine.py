@@ -10,26 +10,26 @@ from dataclasses import dataclass, replace
 from functools import partial
 from typing import TYPE_CHECKING
 
-from protos.base.errors import DecodeError, UnknownKindError
-from protos.model.ids import Role
-from protos.model.members import MAX_PEERS, PeerSet, RemovalReason, ServiceUse
-from sidecar.core.base.report_scope import ReportScope
-from sidecar.core.base.slices import SLICE, Backlog, Step, rest
-from sidecar.core.base.values import ExecutionId, PathId, PathState, RejectReason, RequestId
-from sidecar.core.cloud.serving import Serving, ServingParts
-from sidecar.core.engine.attention import Attention
-from sidecar.core.engine.peers import Peers
-from sidecar.core.engine.revocation_exchange import RevocationExchange
-from sidecar.core.robot.dispatch.context import RequestParts
-from sidecar.core.robot.dispatch.penalties import Penalties
-from sidecar.core.robot.goodbyes import Goodbyes
-from sidecar.core.robot.measure.measurements import Measurements
-from sidecar.core.robot.request.mapping_table import MappingTable
-from sidecar.core.robot.request.service_catalog import Offers
-from sidecar.core.robot.request_table import RequestTable
-from sidecar.core.rules.service_rule import Rules, ServiceRule
-from sidecar.core.seam.application import ApplicationEvent, OfferService, WithdrawService
-from sidecar.core.seam.links import (
+from plr.protos.base.errors import DecodeError, UnknownKindError
+from plr.protos.model.ids import Role
+from plr.protos.model.members import MAX_PEERS, PeerSet, RemovalReason, ServiceUse
+from plr.sidecar.core.base.report_scope import ReportScope
+from plr.sidecar.core.base.slices import SLICE, Backlog, Step, rest
+from plr.sidecar.core.base.values import ExecutionId, PathId, PathState, RejectReason, RequestId
+from plr.sidecar.core.cloud.serving import Serving, ServingParts
+from plr.sidecar.core.engine.attention import Attention
+from plr.sidecar.core.engine.peers import Peers
+from plr.sidecar.core.engine.revocation_exchange import RevocationExchange
+from plr.sidecar.core.robot.dispatch.context import RequestParts
+from plr.sidecar.core.robot.dispatch.penalties import Penalties
+from plr.sidecar.core.robot.goodbyes import Goodbyes
+from plr.sidecar.core.robot.measure.measurements import Measurements
+from plr.sidecar.core.robot.request.mapping_table import MappingTable
+from plr.sidecar.core.robot.request.service_catalog import Offers
+from plr.sidecar.core.robot.request_table import RequestTable
+from plr.sidecar.core.rules.service_rule import Rules, ServiceRule
+from plr.sidecar.core.seam.application import ApplicationEvent, OfferService, WithdrawService
+from plr.sidecar.core.seam.links import (
     Attend,
     FinishedLost,
     FragmentsLost,
@@ -50,11 +50,11 @@ from sidecar.core.seam.links import (
     Seek,
     SetPeers,
 )
-from sidecar.core.seam.stats import EngineStats
-from sidecar.core.transfer.inbound import Inbound
-from sidecar.core.transfer.outbox import Outbox
-from sidecar.core.transfer.routes import Routes
-from sidecar.core.wire.messages import (
+from plr.sidecar.core.seam.stats import EngineStats
+from plr.sidecar.core.transfer.inbound import Inbound
+from plr.sidecar.core.transfer.outbox import Outbox
+from plr.sidecar.core.transfer.routes import Routes
+from plr.sidecar.core.wire.messages import (
     CancelMessage,
     RequestMessage,
     ResponseMessage,
@@ -67,13 +67,13 @@ from sidecar.core.wire.messages import (
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterable, Iterator, Mapping
 
-    from protos.model.ids import InterfaceName, NodeName, ServiceName, SessionId
-    from protos.model.mapping import MappingSet, ServiceMapping
-    from protos.model.members import Peer, ServiceOffer
-    from protos.model.report import Report
-    from sidecar.core.crypto.session import OwnSession
-    from sidecar.core.message.decoding import Decoding
-    from sidecar.core.rules.budget import Budget
+    from plr.protos.model.ids import InterfaceName, NodeName, ServiceName, SessionId
+    from plr.protos.model.mapping import MappingSet, ServiceMapping
+    from plr.protos.model.members import Peer, ServiceOffer
+    from plr.protos.model.report import Report
+    from plr.sidecar.core.crypto.session import OwnSession
+    from plr.sidecar.core.message.decoding import Decoding
+    from plr.sidecar.core.rules.budget import Budget
 
 SWEEP_EVERY_S = 1.0
 """Interval of the search for old messages and partial messages."""

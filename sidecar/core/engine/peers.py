@@ -18,23 +18,23 @@ import dataclasses
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from protos.base.errors import DecodeError
-from protos.model.ids import Version
-from protos.model.members import MAX_PEERS, NO_POLICY, POLICY_PENDING, PeerSet, RemovalReason
-from protos.trust.identity import CertificateError
-from sidecar.core.engine.announced import Announced
-from sidecar.core.engine.verification_budget import VerificationBudget
-from sidecar.core.seam.links import LinkPeer
+from plr.protos.base.errors import DecodeError
+from plr.protos.model.ids import Version
+from plr.protos.model.members import MAX_PEERS, NO_POLICY, POLICY_PENDING, PeerSet, RemovalReason
+from plr.protos.trust.identity import CertificateError
+from plr.sidecar.core.engine.announced import Announced
+from plr.sidecar.core.engine.verification_budget import VerificationBudget
+from plr.sidecar.core.seam.links import LinkPeer
 
 if TYPE_CHECKING:
     from collections import Counter
     from collections.abc import Callable, Iterable
 
-    from protos.model.ids import Address, InterfaceId, NodeName, ServiceName, SessionId
-    from protos.model.members import Peer
-    from sidecar.core.crypto.key_schedule import PairKeys
-    from sidecar.core.crypto.session import OwnSession
-    from sidecar.core.seam.links import PeerRenewed, PeerRestarted
+    from plr.protos.model.ids import Address, InterfaceId, NodeName, ServiceName, SessionId
+    from plr.protos.model.members import Peer
+    from plr.sidecar.core.crypto.key_schedule import PairKeys
+    from plr.sidecar.core.crypto.session import OwnSession
+    from plr.sidecar.core.seam.links import PeerRenewed, PeerRestarted
 
 RESTART_GAP_S = 1.0
 """A peer that restarts more often is not believed: every restart costs all links work. The cost of verifying

@@ -16,18 +16,18 @@ from dataclasses import dataclass, field
 from itertools import islice
 from typing import TYPE_CHECKING, TypeVar
 
-from sidecar.core.base.values import Priority
-from sidecar.core.wire.messages import RevocationLists, RevocationsHeld, RevocationsWanted, encode_message
+from plr.sidecar.core.base.values import Priority
+from plr.sidecar.core.wire.messages import RevocationLists, RevocationsHeld, RevocationsWanted, encode_message
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
 
-    from protos.model.ids import NodeName
-    from sidecar.core.message.outbound import OutboundMessage
-    from sidecar.core.seam.stats import EngineStats
-    from sidecar.core.transfer.outbox import Outbox
-    from sidecar.core.transfer.routes import Routes
-    from sidecar.core.wire.messages import Encoded, RevocationMessage
+    from plr.protos.model.ids import NodeName
+    from plr.sidecar.core.message.outbound import OutboundMessage
+    from plr.sidecar.core.seam.stats import EngineStats
+    from plr.sidecar.core.transfer.outbox import Outbox
+    from plr.sidecar.core.transfer.routes import Routes
+    from plr.sidecar.core.wire.messages import Encoded, RevocationMessage
 
 ASK_AFTER_S = 0.5
 """Time between hearing of a newer list and asking for it: the control plane's own copy may be on its way."""

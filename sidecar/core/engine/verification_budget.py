@@ -10,12 +10,12 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from protos.base.token_bucket import TokenBucket
+from plr.protos.base.token_bucket import TokenBucket
 
 if TYPE_CHECKING:
     from collections.abc import Container
 
-    from protos.model.ids import NodeName
+    from plr.protos.model.ids import NodeName
 
 LOOKS_PER_S = 10.0
 """Looks for each peer. A hundred forgeries a second delay a restart by some ten tries, 2.5 s in the median."""

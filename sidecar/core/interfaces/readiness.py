@@ -11,7 +11,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from protos.model.ids import InterfaceName
+    from plr.protos.model.ids import InterfaceName
 
 STUN_GRACE_S = 3.0
 """Time for three requests to a STUN server (RFC 8489 section 6.2.1 starts at 0.5 s and doubles)."""

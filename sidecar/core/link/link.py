@@ -8,17 +8,17 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
-from sidecar.core.base.timers import NEVER, Timers
-from sidecar.core.base.values import PathId, PathState
-from sidecar.core.link.liveness import PathKeeper
-from sidecar.core.link.memory import LinkMemory
-from sidecar.core.link.mtu import LinkMtu
-from sidecar.core.link.path_table import PathTable
-from sidecar.core.link.receiver import LinkReader
-from sidecar.core.link.sender import Batch, Burst, DatagramBuilder
-from sidecar.core.path.key_exchange import DEFAULT_LIMITS, KeyLimits
-from sidecar.core.path.view import view_of
-from sidecar.core.seam.links import (
+from plr.sidecar.core.base.timers import NEVER, Timers
+from plr.sidecar.core.base.values import PathId, PathState
+from plr.sidecar.core.link.liveness import PathKeeper
+from plr.sidecar.core.link.memory import LinkMemory
+from plr.sidecar.core.link.mtu import LinkMtu
+from plr.sidecar.core.link.path_table import PathTable
+from plr.sidecar.core.link.receiver import LinkReader
+from plr.sidecar.core.link.sender import Batch, Burst, DatagramBuilder
+from plr.sidecar.core.path.key_exchange import DEFAULT_LIMITS, KeyLimits
+from plr.sidecar.core.path.view import view_of
+from plr.sidecar.core.seam.links import (
     Attend,
     CheckPaths,
     FinishedLost,
@@ -43,21 +43,21 @@ from sidecar.core.seam.links import (
     SetPeers,
     SetReady,
 )
-from sidecar.core.seam.stats import PathStats
-from sidecar.core.wire import frame
+from plr.sidecar.core.seam.stats import PathStats
+from plr.sidecar.core.wire import frame
 
 if TYPE_CHECKING:
     import random
     from collections import deque
     from collections.abc import Callable, Iterable, Iterator
 
-    from protos.model.ids import Address, NodeName
-    from sidecar.core.link.pinging import Pong
-    from sidecar.core.link.sender import LinkIdentity
-    from sidecar.core.message.outbound import OutboundMessage
-    from sidecar.core.path.path import Path
-    from sidecar.core.path.view import PathView
-    from sidecar.core.seam.links import LinkPeer
+    from plr.protos.model.ids import Address, NodeName
+    from plr.sidecar.core.link.pinging import Pong
+    from plr.sidecar.core.link.sender import LinkIdentity
+    from plr.sidecar.core.message.outbound import OutboundMessage
+    from plr.sidecar.core.path.path import Path
+    from plr.sidecar.core.path.view import PathView
+    from plr.sidecar.core.seam.links import LinkPeer
 
 MAX_FINISHED_DELAY_S = 0.003
 """How long FINISHED of a small request, and the acknowledgement with it, waits for the answer. It is less than

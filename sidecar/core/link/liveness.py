@@ -4,17 +4,17 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from sidecar.core.base.values import PathState
-from sidecar.core.seam.links import FinishedLost, FragmentsLost, PathChanged, PeerLied
-from sidecar.core.wire.frame import KEY_ANSWER_TYPE, encode_key_answer
+from plr.sidecar.core.base.values import PathState
+from plr.sidecar.core.seam.links import FinishedLost, FragmentsLost, PathChanged, PeerLied
+from plr.sidecar.core.wire.frame import KEY_ANSWER_TYPE, encode_key_answer
 
 if TYPE_CHECKING:
-    from sidecar.core.link.mtu import LinkMtu
-    from sidecar.core.link.path_table import PathTable
-    from sidecar.core.message.outbound import OutboundMessage
-    from sidecar.core.path.in_flight import Sent
-    from sidecar.core.path.path import Path
-    from sidecar.core.wire import frame
+    from plr.sidecar.core.link.mtu import LinkMtu
+    from plr.sidecar.core.link.path_table import PathTable
+    from plr.sidecar.core.message.outbound import OutboundMessage
+    from plr.sidecar.core.path.in_flight import Sent
+    from plr.sidecar.core.path.path import Path
+    from plr.sidecar.core.wire import frame
 
 
 class PathKeeper:

@@ -12,8 +12,8 @@ from collections import OrderedDict
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from protos.model.ids import InterfaceId, NodeName, SessionId
-    from sidecar.core.path.keys import PathKeys
+    from plr.protos.model.ids import InterfaceId, NodeName, SessionId
+    from plr.sidecar.core.path.keys import PathKeys
 
 MAX_PATHS_OF_A_PEER = 256
 """As many as one session can have to one of our interfaces, since an interface's number has 8 bits. So a share never

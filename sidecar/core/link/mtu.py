@@ -4,19 +4,19 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from sidecar.core.base.values import PathState
-from sidecar.core.path.pmtu import payloads
-from sidecar.core.seam.links import FragmentsLost, PathMtuChanged
-from sidecar.core.wire.frame import BASE_BYTES
+from plr.sidecar.core.base.values import PathState
+from plr.sidecar.core.path.pmtu import payloads
+from plr.sidecar.core.seam.links import FragmentsLost, PathMtuChanged
+from plr.sidecar.core.wire.frame import BASE_BYTES
 
 if TYPE_CHECKING:
     from collections import deque
     from collections.abc import Iterable
 
-    from protos.model.ids import Address
-    from sidecar.core.path.in_flight import Sent
-    from sidecar.core.path.path import Path
-    from sidecar.core.seam.links import LinkEvent
+    from plr.protos.model.ids import Address
+    from plr.sidecar.core.path.in_flight import Sent
+    from plr.sidecar.core.path.path import Path
+    from plr.sidecar.core.seam.links import LinkEvent
 
 DEFAULT_MTU = 1500
 """Ethernet's MTU in bytes, used until the interface's own is known."""

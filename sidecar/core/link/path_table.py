@@ -5,25 +5,25 @@ from __future__ import annotations
 from collections import deque
 from typing import TYPE_CHECKING
 
-from protos.base.token_bucket import TokenBucket
-from protos.model.ids import Role
-from sidecar.core.base.values import PathId, PathState
-from sidecar.core.link.memory import LinkMemory
-from sidecar.core.link.pinging import Pings
-from sidecar.core.path.key_exchange import EXCHANGES_AT_ONCE, EXCHANGES_PER_S
-from sidecar.core.path.keys import make_path_keys
-from sidecar.core.path.path import Path
-from sidecar.core.seam.stats import LinkStats
-from sidecar.core.wire.introduction import hello_id
+from plr.protos.base.token_bucket import TokenBucket
+from plr.protos.model.ids import Role
+from plr.sidecar.core.base.values import PathId, PathState
+from plr.sidecar.core.link.memory import LinkMemory
+from plr.sidecar.core.link.pinging import Pings
+from plr.sidecar.core.path.key_exchange import EXCHANGES_AT_ONCE, EXCHANGES_PER_S
+from plr.sidecar.core.path.keys import make_path_keys
+from plr.sidecar.core.path.path import Path
+from plr.sidecar.core.seam.stats import LinkStats
+from plr.sidecar.core.wire.introduction import hello_id
 
 if TYPE_CHECKING:
     import random
     from collections.abc import Sequence
 
-    from protos.model.ids import Address, InterfaceId, NodeName, SessionId
-    from sidecar.core.link.sender import LinkIdentity
-    from sidecar.core.path.key_exchange import KeyLimits
-    from sidecar.core.seam.links import LinkEvent, LinkPeer
+    from plr.protos.model.ids import Address, InterfaceId, NodeName, SessionId
+    from plr.sidecar.core.link.sender import LinkIdentity
+    from plr.sidecar.core.path.key_exchange import KeyLimits
+    from plr.sidecar.core.seam.links import LinkEvent, LinkPeer
 
 MAX_PENDING_FRAMES = 256
 """Control frames waiting on one path besides FINISHED; only a dishonest peer makes us owe more."""

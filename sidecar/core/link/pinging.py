@@ -11,17 +11,17 @@ from collections import deque
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from protos.base.token_bucket import TokenBucket
-from sidecar.core.base.values import PathState
-from sidecar.core.crypto.aead import TAG_BYTES
-from sidecar.core.path.congestion.rtt import LONGEST_ANSWER_S
-from sidecar.core.path.probing import SentPing
-from sidecar.core.wire.frame import HEADER_BYTES
+from plr.protos.base.token_bucket import TokenBucket
+from plr.sidecar.core.base.values import PathState
+from plr.sidecar.core.crypto.aead import TAG_BYTES
+from plr.sidecar.core.path.congestion.rtt import LONGEST_ANSWER_S
+from plr.sidecar.core.path.probing import SentPing
+from plr.sidecar.core.wire.frame import HEADER_BYTES
 
 if TYPE_CHECKING:
-    from sidecar.core.base.values import PathId
-    from sidecar.core.path.path import Path
-    from sidecar.core.seam.links import Ping
+    from plr.sidecar.core.base.values import PathId
+    from plr.sidecar.core.path.path import Path
+    from plr.sidecar.core.seam.links import Ping
 
 PINGS_PER_S = 20.0
 """Rate of one link, however many ask: some 30 kB a second of the longest that Ethernet carries, ..."""

@@ -11,14 +11,14 @@ from typing import TYPE_CHECKING, TypeVar
 
 from cryptography.exceptions import InvalidTag
 
-from protos.base.errors import DecodeError
-from protos.model.ids import InterfaceId, Role, SessionId
-from sidecar.core.base.values import PathState
-from sidecar.core.crypto.aead import TAG_BYTES
-from sidecar.core.link.path_table import MAX_INTRODUCTIONS
-from sidecar.core.path.key_exchange import TooManyExchangesError
-from sidecar.core.path.keys import MAX_FAILED
-from sidecar.core.seam.links import (
+from plr.protos.base.errors import DecodeError
+from plr.protos.model.ids import InterfaceId, Role, SessionId
+from plr.sidecar.core.base.values import PathState
+from plr.sidecar.core.crypto.aead import TAG_BYTES
+from plr.sidecar.core.link.path_table import MAX_INTRODUCTIONS
+from plr.sidecar.core.path.key_exchange import TooManyExchangesError
+from plr.sidecar.core.path.keys import MAX_FAILED
+from plr.sidecar.core.seam.links import (
     FragmentsReceived,
     MessageAbandoned,
     MessageFinished,
@@ -27,8 +27,8 @@ from sidecar.core.seam.links import (
     PeerRenewed,
     PeerRestarted,
 )
-from sidecar.core.wire import frame
-from sidecar.core.wire.frame import (
+from plr.sidecar.core.wire import frame
+from plr.sidecar.core.wire.frame import (
     CLEAR,
     FRAGMENT_HEAD,
     FRAGMENT_HEAD_BYTES,
@@ -44,17 +44,17 @@ from sidecar.core.wire.frame import (
     Fragment,
     is_repair_index,
 )
-from sidecar.core.wire.introduction import UnauthenticError, open_introduction, read_hello_id
+from plr.sidecar.core.wire.introduction import UnauthenticError, open_introduction, read_hello_id
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from protos.model.ids import Address
-    from sidecar.core.link.liveness import PathKeeper
-    from sidecar.core.link.mtu import LinkMtu
-    from sidecar.core.link.path_table import PathTable
-    from sidecar.core.path.path import Path
-    from sidecar.core.wire.frame import Header
+    from plr.protos.model.ids import Address
+    from plr.sidecar.core.link.liveness import PathKeeper
+    from plr.sidecar.core.link.mtu import LinkMtu
+    from plr.sidecar.core.link.path_table import PathTable
+    from plr.sidecar.core.path.path import Path
+    from plr.sidecar.core.wire.frame import Header
 
 _OVERHEAD_BYTES = HEADER_BYTES + TAG_BYTES
 

@@ -5,15 +5,15 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, NamedTuple
 
-from protos.model.ids import Role
-from protos.trust.pair_token import pair_token
-from sidecar.core.base.timers import NEVER
-from sidecar.core.base.values import PathState
-from sidecar.core.crypto.aead import TAG_BYTES
-from sidecar.core.link.path_table import MAX_PENDING_FRAMES
-from sidecar.core.path.address import LEAST_CREDIT_BYTES
-from sidecar.core.wire import frame
-from sidecar.core.wire.frame import (
+from plr.protos.model.ids import Role
+from plr.protos.trust.pair_token import pair_token
+from plr.sidecar.core.base.timers import NEVER
+from plr.sidecar.core.base.values import PathState
+from plr.sidecar.core.crypto.aead import TAG_BYTES
+from plr.sidecar.core.link.path_table import MAX_PENDING_FRAMES
+from plr.sidecar.core.path.address import LEAST_CREDIT_BYTES
+from plr.sidecar.core.wire import frame
+from plr.sidecar.core.wire.frame import (
     BASE_FRAMES_BYTES,
     CLEAR,
     FRAGMENT_DATAGRAM_BYTES,
@@ -25,15 +25,15 @@ from sidecar.core.wire.frame import (
     REPAIR_TYPE,
     Header,
 )
-from sidecar.core.wire.introduction import INTRODUCTION_BYTES, encode_introduction
+from plr.sidecar.core.wire.introduction import INTRODUCTION_BYTES, encode_introduction
 
 if TYPE_CHECKING:
-    from protos.model.ids import Address, InterfaceId, InterfaceName, NodeName, SessionId
-    from protos.trust.credential import SessionCredential
-    from sidecar.core.message.outbound import OutboundMessage
-    from sidecar.core.path.path import Path
-    from sidecar.core.path.send_queue import Run
-    from sidecar.core.seam.stats import LinkStats
+    from plr.protos.model.ids import Address, InterfaceId, InterfaceName, NodeName, SessionId
+    from plr.protos.trust.credential import SessionCredential
+    from plr.sidecar.core.message.outbound import OutboundMessage
+    from plr.sidecar.core.path.path import Path
+    from plr.sidecar.core.path.send_queue import Run
+    from plr.sidecar.core.seam.stats import LinkStats
 
 BURST_DATAGRAMS = 64
 """Datagrams built in one go before the driver looks at the socket again (about 70 kB, some milliseconds)."""

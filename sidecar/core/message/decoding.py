@@ -11,14 +11,14 @@ from collections import OrderedDict, deque
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
-from sidecar.core.base.fair_share import Shares
+from plr.sidecar.core.base.fair_share import Shares
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from protos.model.ids import NodeName, SessionId
-    from sidecar.core.base.values import PathId
-    from sidecar.core.message.partial import Partial
+    from plr.protos.model.ids import NodeName, SessionId
+    from plr.sidecar.core.base.values import PathId
+    from plr.sidecar.core.message.partial import Partial
 
 MAX_BYTES = 128 * 1024 * 1024
 """Bytes of the messages in line, repair symbols included. One peer may hold half: two of the largest that came as

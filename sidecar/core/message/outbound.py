@@ -4,17 +4,17 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from sidecar.core.base.timers import NEVER
-from sidecar.core.base.values import Priority
-from sidecar.core.wire import fec
-from sidecar.core.wire.frame import BASE_SYMBOL_BYTES, FRAGMENT_OVERHEAD_BYTES, MIN_SYMBOL_BYTES, symbol_count
+from plr.sidecar.core.base.timers import NEVER
+from plr.sidecar.core.base.values import Priority
+from plr.sidecar.core.wire import fec
+from plr.sidecar.core.wire.frame import BASE_SYMBOL_BYTES, FRAGMENT_OVERHEAD_BYTES, MIN_SYMBOL_BYTES, symbol_count
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
-    from protos.model.ids import NodeName
-    from sidecar.core.base.values import PathId, RequestId
-    from sidecar.core.wire.messages import Encoded
+    from plr.protos.model.ids import NodeName
+    from plr.sidecar.core.base.values import PathId, RequestId
+    from plr.sidecar.core.wire.messages import Encoded
 
 
 class OutboundMessage:

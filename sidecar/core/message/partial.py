@@ -5,9 +5,9 @@ from __future__ import annotations
 import mmap
 from typing import TYPE_CHECKING
 
-from sidecar.core.base.timers import NEVER
-from sidecar.core.wire import fec
-from sidecar.core.wire.frame import symbol_count
+from plr.sidecar.core.base.timers import NEVER
+from plr.sidecar.core.wire import fec
+from plr.sidecar.core.wire.frame import symbol_count
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

@@ -10,14 +10,14 @@ import enum
 from collections import OrderedDict
 from typing import TYPE_CHECKING, NamedTuple
 
-from sidecar.core.base.timers import NEVER
-from sidecar.core.message.partial import Partial
+from plr.sidecar.core.base.timers import NEVER
+from plr.sidecar.core.message.partial import Partial
 
 if TYPE_CHECKING:
     from collections import Counter
 
-    from protos.model.ids import NodeName
-    from sidecar.core.wire.frame import Fragment
+    from plr.protos.model.ids import NodeName
+    from plr.sidecar.core.wire.frame import Fragment
 
 MAX_PEER_BYTES = 64 * 1024 * 1024
 """Announced bytes of one peer's unfinished messages: almost four of the largest. A sender keeps below it (`outbox.py`)

@@ -9,7 +9,7 @@ import math
 from functools import lru_cache
 from typing import NamedTuple
 
-from sidecar.core.wire import fec
+from plr.sidecar.core.wire import fec
 
 FAST_DATAGRAMS = 200.0
 """Memory of the estimate that rises soon after losses begin ..."""

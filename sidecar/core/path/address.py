@@ -10,7 +10,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from protos.model.ids import Address
+    from plr.protos.model.ids import Address
 
 AMPLIFICATION = 3
 """Bytes that may go to an unproven address for each byte that came from it (RFC 9000 section 8)."""

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, NamedTuple
 if TYPE_CHECKING:
     from collections import Counter
 
-    from sidecar.core.base.values import PathId, PathState
-    from sidecar.core.seam.links import PathChanged
+    from plr.sidecar.core.base.values import PathId, PathState
+    from plr.sidecar.core.seam.links import PathChanged
 
 MAX_REMEMBERED = 4096
 """Paths remembered per interface, those of departed peers included. Beyond it the one that changed longest ago goes."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, NamedTuple
 
 if TYPE_CHECKING:
-    from sidecar.core.message.outbound import OutboundMessage
+    from plr.sidecar.core.message.outbound import OutboundMessage
 
 
 class Sent(NamedTuple):

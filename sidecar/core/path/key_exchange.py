@@ -20,15 +20,15 @@ from typing import TYPE_CHECKING
 
 from cryptography.hazmat.primitives.asymmetric.x25519 import X25519PrivateKey, X25519PublicKey
 
-from protos.base.errors import DecodeError
-from sidecar.core.crypto.key_schedule import next_root, proof, proof_of_offer
-from sidecar.core.wire.frame import KeyAnswer, KeyOffer
+from plr.protos.base.errors import DecodeError
+from plr.sidecar.core.crypto.key_schedule import next_root, proof, proof_of_offer
+from plr.sidecar.core.wire.frame import KeyAnswer, KeyOffer
 
 if TYPE_CHECKING:
     import random
 
-    from protos.base.token_bucket import TokenBucket
-    from sidecar.core.crypto.key_schedule import PairKeys
+    from plr.protos.base.token_bucket import TokenBucket
+    from plr.sidecar.core.crypto.key_schedule import PairKeys
 
 RENEW_AFTER_S = 120.0
 """Age of a phase at which the next one is offered, as in WireGuard."""

@@ -17,23 +17,23 @@ from typing import TYPE_CHECKING
 
 from cryptography.exceptions import InvalidTag
 
-from sidecar.core.crypto import aead as ciphers
-from sidecar.core.path.key_exchange import KeyExchange
-from sidecar.core.path.received import ReceivedPackets
-from sidecar.core.wire.frame import PHASE_FLAG, clear_head
+from plr.sidecar.core.crypto import aead as ciphers
+from plr.sidecar.core.path.key_exchange import KeyExchange
+from plr.sidecar.core.path.received import ReceivedPackets
+from plr.sidecar.core.wire.frame import PHASE_FLAG, clear_head
 
 if TYPE_CHECKING:
     import random
 
     from cryptography.utils import Buffer
 
-    from protos.base.token_bucket import TokenBucket
-    from protos.model.ids import InterfaceId
-    from protos.trust.credential import Aead
-    from sidecar.core.crypto.aead import Cipher
-    from sidecar.core.crypto.key_schedule import PairKeys
-    from sidecar.core.path.key_exchange import KeyLimits
-    from sidecar.core.wire.frame import KeyAnswer, KeyOffer
+    from plr.protos.base.token_bucket import TokenBucket
+    from plr.protos.model.ids import InterfaceId
+    from plr.protos.trust.credential import Aead
+    from plr.sidecar.core.crypto.aead import Cipher
+    from plr.sidecar.core.crypto.key_schedule import PairKeys
+    from plr.sidecar.core.path.key_exchange import KeyLimits
+    from plr.sidecar.core.wire.frame import KeyAnswer, KeyOffer
 
 _PHASE = PHASE_FLAG << 16
 """The phase bit in the first four clear bytes as one number."""

@@ -4,27 +4,27 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from sidecar.core.base.timers import NEVER
-from sidecar.core.base.values import PathId, PathState
-from sidecar.core.path.address import PathAddress
-from sidecar.core.path.congestion.controller import CongestionController
-from sidecar.core.path.congestion.rtt import RttEstimator
-from sidecar.core.path.pmtu import PathMtu
-from sidecar.core.path.probing import Probing
-from sidecar.core.path.recovery import Recovery
-from sidecar.core.path.send_queue import SendQueue
-from sidecar.core.seam.links import PathMeasured
-from sidecar.core.wire.frame import Finished, encode_ack, encode_finished
+from plr.sidecar.core.base.timers import NEVER
+from plr.sidecar.core.base.values import PathId, PathState
+from plr.sidecar.core.path.address import PathAddress
+from plr.sidecar.core.path.congestion.controller import CongestionController
+from plr.sidecar.core.path.congestion.rtt import RttEstimator
+from plr.sidecar.core.path.pmtu import PathMtu
+from plr.sidecar.core.path.probing import Probing
+from plr.sidecar.core.path.recovery import Recovery
+from plr.sidecar.core.path.send_queue import SendQueue
+from plr.sidecar.core.seam.links import PathMeasured
+from plr.sidecar.core.wire.frame import Finished, encode_ack, encode_finished
 
 if TYPE_CHECKING:
     import random
     from collections.abc import Collection
 
-    from protos.base.token_bucket import TokenBucket
-    from protos.model.ids import Address, InterfaceId, NodeName, SessionId
-    from sidecar.core.path.keys import PathKeys
-    from sidecar.core.path.probing import SentPing
-    from sidecar.core.wire.frame import KeyAnswer, KeyOffer
+    from plr.protos.base.token_bucket import TokenBucket
+    from plr.protos.model.ids import Address, InterfaceId, NodeName, SessionId
+    from plr.sidecar.core.path.keys import PathKeys
+    from plr.sidecar.core.path.probing import SentPing
+    from plr.sidecar.core.wire.frame import KeyAnswer, KeyOffer
 
 DOWN_FACTOR = 4.0
 """An unstable path is down after this many times the silence that made it unstable, or after the longest wait on top of

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from functools import lru_cache
 
-from sidecar.core.wire.frame import BASE_BYTES, MAX_DATAGRAM_BYTES
+from plr.sidecar.core.wire.frame import BASE_BYTES, MAX_DATAGRAM_BYTES
 
 COMMON_MTUS = (1280, 1400, 1420, 1492, 1500, 4096, 9000)
 """MTUs tried, where the interface takes them: IPv6's minimum, mobile networks, WireGuard, PPPoE, Ethernet, jumbo

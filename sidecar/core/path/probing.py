@@ -10,13 +10,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, NamedTuple
 
-from sidecar.core.path.congestion.rtt import LONGEST_ANSWER_S
+from plr.sidecar.core.path.congestion.rtt import LONGEST_ANSWER_S
 
 if TYPE_CHECKING:
     import random
 
-    from protos.model.ids import Address
-    from sidecar.core.base.values import PathId
+    from plr.protos.model.ids import Address
+    from plr.sidecar.core.base.values import PathId
 
 IDLE_PROBE_S = 0.5
 """Interval of probes on a recently used path; it finds a dead one within a second, ..."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from sidecar.core.wire.frame import MAX_ACK_RANGES
+from plr.sidecar.core.wire.frame import MAX_ACK_RANGES
 
 MAX_ACK_DELAY_S = 0.005
 """Longest time that a lone datagram's acknowledgement waits for something to travel with."""

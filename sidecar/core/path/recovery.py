@@ -8,17 +8,17 @@ from collections import deque
 from operator import attrgetter
 from typing import TYPE_CHECKING
 
-from sidecar.core.path.congestion.controller import RateSample
-from sidecar.core.path.congestion.rtt import RttEstimator
-from sidecar.core.path.in_flight import Sent
-from sidecar.core.path.received import MAX_ACK_DELAY_S
-from sidecar.core.path.reordering import Reordering
+from plr.sidecar.core.path.congestion.controller import RateSample
+from plr.sidecar.core.path.congestion.rtt import RttEstimator
+from plr.sidecar.core.path.in_flight import Sent
+from plr.sidecar.core.path.received import MAX_ACK_DELAY_S
+from plr.sidecar.core.path.reordering import Reordering
 
 if TYPE_CHECKING:
     import random
 
-    from sidecar.core.message.outbound import OutboundMessage
-    from sidecar.core.wire.frame import AckFrame
+    from plr.sidecar.core.message.outbound import OutboundMessage
+    from plr.sidecar.core.wire.frame import AckFrame
 
 PTO_DATAGRAMS = 2
 """Number of the oldest datagrams that a probe timeout gives up (RFC 9002 section 6.2.4 allows two probes)."""

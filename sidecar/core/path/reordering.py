@@ -16,13 +16,13 @@ from enum import Enum, auto
 from itertools import takewhile
 from typing import TYPE_CHECKING, NamedTuple
 
-from sidecar.core.path.congestion.rtt import LONGEST_ANSWER_S
+from plr.sidecar.core.path.congestion.rtt import LONGEST_ANSWER_S
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
 
-    from sidecar.core.path.congestion.rtt import RttEstimator
-    from sidecar.core.path.in_flight import Sent
+    from plr.sidecar.core.path.congestion.rtt import RttEstimator
+    from plr.sidecar.core.path.in_flight import Sent
 
 PACKET_THRESHOLD = 3
 """A datagram is lost when one sent this many later is acknowledged (RFC 9002 section 6.1.1)."""

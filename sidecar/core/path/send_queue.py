@@ -21,14 +21,14 @@ from collections import deque
 from itertools import count
 from typing import TYPE_CHECKING, NamedTuple, TypeAlias
 
-from sidecar.core.base.timers import NEVER
-from sidecar.core.base.values import SHARE, Priority
-from sidecar.core.wire.frame import FRAGMENT_OVERHEAD_BYTES
+from plr.sidecar.core.base.timers import NEVER
+from plr.sidecar.core.base.values import SHARE, Priority
+from plr.sidecar.core.wire.frame import FRAGMENT_OVERHEAD_BYTES
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
-    from sidecar.core.message.outbound import OutboundMessage
+    from plr.sidecar.core.message.outbound import OutboundMessage
 
 HASTE = 1.25
 """A message that has not begun to leave is late when this many times its sending time no longer fits: a message that

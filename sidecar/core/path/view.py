@@ -6,9 +6,9 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from protos.model.ids import Address
-    from sidecar.core.base.values import PathId, PathState
-    from sidecar.core.path.path import Path
+    from plr.protos.model.ids import Address
+    from plr.sidecar.core.base.values import PathId, PathState
+    from plr.sidecar.core.path.path import Path
 
 
 @dataclass(frozen=True, slots=True)

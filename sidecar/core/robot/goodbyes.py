@@ -7,12 +7,12 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from protos.model.report import MAX_GOODBYES
+from plr.protos.model.report import MAX_GOODBYES
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from protos.model.ids import NodeName, SessionId
+    from plr.protos.model.ids import NodeName, SessionId
 
 
 class Goodbyes:

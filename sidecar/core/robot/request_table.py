@@ -17,27 +17,27 @@ import heapq
 from functools import partial
 from typing import TYPE_CHECKING
 
-from protos.base.histogram import Histogram
-from protos.model.mapping import Assignment
-from sidecar.core.base.slices import GROUP, rest
-from sidecar.core.base.timers import first_of
-from sidecar.core.base.values import PathId, PathState, RejectReason, RequestId
-from sidecar.core.robot.dispatch.backlog import NoRoom
-from sidecar.core.robot.dispatch.cancelling import SMALL_ANSWER_BYTES, CallingOff
-from sidecar.core.robot.dispatch.dispatcher import MAX_COPIES, Dispatching
-from sidecar.core.robot.measure.outcomes import measure_outcomes
-from sidecar.core.robot.request.request import Answer, Copy, CopyState, Request
-from sidecar.core.seam.application import DeadlineMissed, RequestFailed, ResponseArrived, Unreachable
-from sidecar.core.wire.messages import MAX_NAME_BYTES, MAX_PAYLOAD_BYTES, RejectionMessage, ResponseMessage
+from plr.protos.base.histogram import Histogram
+from plr.protos.model.mapping import Assignment
+from plr.sidecar.core.base.slices import GROUP, rest
+from plr.sidecar.core.base.timers import first_of
+from plr.sidecar.core.base.values import PathId, PathState, RejectReason, RequestId
+from plr.sidecar.core.robot.dispatch.backlog import NoRoom
+from plr.sidecar.core.robot.dispatch.cancelling import SMALL_ANSWER_BYTES, CallingOff
+from plr.sidecar.core.robot.dispatch.dispatcher import MAX_COPIES, Dispatching
+from plr.sidecar.core.robot.measure.outcomes import measure_outcomes
+from plr.sidecar.core.robot.request.request import Answer, Copy, CopyState, Request
+from plr.sidecar.core.seam.application import DeadlineMissed, RequestFailed, ResponseArrived, Unreachable
+from plr.sidecar.core.wire.messages import MAX_NAME_BYTES, MAX_PAYLOAD_BYTES, RejectionMessage, ResponseMessage
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Iterable, Iterator
 
-    from protos.model.ids import NodeName, ServiceName
-    from sidecar.core.base.slices import Step
-    from sidecar.core.message.outbound import OutboundMessage
-    from sidecar.core.robot.dispatch.context import RequestParts
-    from sidecar.core.rules.service_rule import ServiceRule
+    from plr.protos.model.ids import NodeName, ServiceName
+    from plr.sidecar.core.base.slices import Step
+    from plr.sidecar.core.message.outbound import OutboundMessage
+    from plr.sidecar.core.robot.dispatch.context import RequestParts
+    from plr.sidecar.core.rules.service_rule import ServiceRule
 
 MAX_IN_FLIGHT = 8192
 """Most requests that wait for a response."""

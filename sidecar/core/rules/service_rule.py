@@ -12,15 +12,15 @@ import re
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from protos.model.members import EVERY_INTERFACE, Copies
-from protos.model.redundancy_mode import DEFAULT_ADAPTIVE_TARGET, DEFAULT_HEDGE_QUANTILE, RedundancyMode
-from sidecar.core.base.values import Priority
+from plr.protos.model.members import EVERY_INTERFACE, Copies
+from plr.protos.model.redundancy_mode import DEFAULT_ADAPTIVE_TARGET, DEFAULT_HEDGE_QUANTILE, RedundancyMode
+from plr.sidecar.core.base.values import Priority
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
 
-    from protos.model.ids import ServiceName
-    from sidecar.core.message.repair import Redundancy
+    from plr.protos.model.ids import ServiceName
+    from plr.sidecar.core.message.repair import Redundancy
 
 
 @dataclass(frozen=True, slots=True)

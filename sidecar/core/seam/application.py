@@ -6,9 +6,9 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from protos.model.ids import InterfaceName, NodeName, ServiceName
-    from protos.model.mapping import Assignment
-    from sidecar.core.base.values import ExecutionId, Priority, RequestId
+    from plr.protos.model.ids import InterfaceName, NodeName, ServiceName
+    from plr.protos.model.mapping import Assignment
+    from plr.sidecar.core.base.values import ExecutionId, Priority, RequestId
 
 
 @dataclass(frozen=True, slots=True)

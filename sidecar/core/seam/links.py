@@ -6,12 +6,12 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, NamedTuple
 
 if TYPE_CHECKING:
-    from protos.model.ids import Address, InterfaceId, NodeName, SessionId
-    from protos.trust.credential import SessionCredential
-    from sidecar.core.base.values import PathId, PathState
-    from sidecar.core.crypto.key_schedule import PairKeys
-    from sidecar.core.message.outbound import OutboundMessage
-    from sidecar.core.wire.frame import Fragment
+    from plr.protos.model.ids import Address, InterfaceId, NodeName, SessionId
+    from plr.protos.trust.credential import SessionCredential
+    from plr.sidecar.core.base.values import PathId, PathState
+    from plr.sidecar.core.crypto.key_schedule import PairKeys
+    from plr.sidecar.core.message.outbound import OutboundMessage
+    from plr.sidecar.core.wire.frame import Fragment
 
 
 @dataclass(frozen=True, slots=True)

@@ -11,8 +11,8 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from protos.base.histogram import Histogram
-    from protos.model.ids import InterfaceName, NodeName, ServiceName
+    from plr.protos.base.histogram import Histogram
+    from plr.protos.model.ids import InterfaceName, NodeName, ServiceName
 
 
 @dataclass(slots=True)
@@ -68,7 +68,7 @@ class EngineStats:
     hedged: Counter[tuple[InterfaceName, NodeName, ServiceName]] = field(default_factory=Counter)
     """Copies sent because another took long."""
     copy_bytes: Counter[tuple[InterfaceName, ServiceName, str]] = field(default_factory=Counter)
-    """(interface, service, copy: first | extra); bytes of messages, see `sidecar.core.robot.dispatch.budgets`."""
+    """(interface, service, copy: first | extra); bytes of messages, see `plr.sidecar.core.robot.dispatch.budgets`."""
     copies_refused: Counter[tuple[InterfaceName, ServiceName, str]] = field(default_factory=Counter)
     """(interface, service, limit: load | day); copies that a budget forbade."""
     bad_answers: Counter[tuple[NodeName, ServiceName]] = field(default_factory=Counter)

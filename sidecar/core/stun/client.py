@@ -12,17 +12,17 @@ from collections import Counter
 from ipaddress import ip_address
 from typing import TYPE_CHECKING, NamedTuple
 
-from protos.base.errors import DecodeError
-from protos.stun.codec import MessageClass, decode, is_stun
-from sidecar.core.stun.events import StunDrop
-from sidecar.core.stun.family import StunClientConfig, StunFamilyClient, StunOutbox
+from plr.protos.base.errors import DecodeError
+from plr.protos.stun.codec import MessageClass, decode, is_stun
+from plr.sidecar.core.stun.events import StunDrop
+from plr.sidecar.core.stun.family import StunClientConfig, StunFamilyClient, StunOutbox
 
 if TYPE_CHECKING:
     import random
     from collections.abc import Iterable
 
-    from protos.model.ids import Address
-    from sidecar.core.stun.events import StunEvent
+    from plr.protos.model.ids import Address
+    from plr.sidecar.core.stun.events import StunEvent
 
 MAX_SERVERS_PER_FAMILY = 4
 """Servers used of those that a control plane names; the others are ignored and counted."""

@@ -7,15 +7,15 @@ from dataclasses import dataclass, field
 from ipaddress import ip_address
 from typing import TYPE_CHECKING
 
-from protos.stun.codec import TRANSACTION_ID_BYTES, MessageClass, StunMessage
-from sidecar.core.stun.events import Failed, Mapped, MappingChanged, StunDrop, StunEvent
-from sidecar.core.stun.transaction import Retransmission, StunTransaction
+from plr.protos.stun.codec import TRANSACTION_ID_BYTES, MessageClass, StunMessage
+from plr.sidecar.core.stun.events import Failed, Mapped, MappingChanged, StunDrop, StunEvent
+from plr.sidecar.core.stun.transaction import Retransmission, StunTransaction
 
 if TYPE_CHECKING:
     import random
     from collections import Counter
 
-    from protos.model.ids import Address
+    from plr.protos.model.ids import Address
 
 MAX_QUEUED_EVENTS = 64
 """Events kept for a driver that does not fetch them; the oldest is dropped first, and counted."""

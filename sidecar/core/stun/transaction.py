@@ -5,10 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from protos.stun.codec import MessageClass, StunMessage, encode
+from plr.protos.stun.codec import MessageClass, StunMessage, encode
 
 if TYPE_CHECKING:
-    from protos.model.ids import Address
+    from plr.protos.model.ids import Address
 
 
 @dataclass(frozen=True, slots=True)

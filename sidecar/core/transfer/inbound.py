@@ -4,20 +4,20 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, NamedTuple
 
-from sidecar.core.message.decoding import Decoding, DecodingLine
-from sidecar.core.message.partial import Partial
-from sidecar.core.message.reassembly import OVER_REMEMBERED, Fate, Reassembler
-from sidecar.core.seam.links import SendFinished, SendForgotten
-from sidecar.core.wire.frame import BASE_SYMBOL_BYTES
+from plr.sidecar.core.message.decoding import Decoding, DecodingLine
+from plr.sidecar.core.message.partial import Partial
+from plr.sidecar.core.message.reassembly import OVER_REMEMBERED, Fate, Reassembler
+from plr.sidecar.core.seam.links import SendFinished, SendForgotten
+from plr.sidecar.core.wire.frame import BASE_SYMBOL_BYTES
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from protos.model.ids import NodeName, SessionId
-    from sidecar.core.base.values import PathId
-    from sidecar.core.seam.links import PathCommand
-    from sidecar.core.seam.stats import EngineStats
-    from sidecar.core.wire.frame import Fragment
+    from plr.protos.model.ids import NodeName, SessionId
+    from plr.sidecar.core.base.values import PathId
+    from plr.sidecar.core.seam.links import PathCommand
+    from plr.sidecar.core.seam.stats import EngineStats
+    from plr.sidecar.core.wire.frame import Fragment
 
 
 class Arrived(NamedTuple):

@@ -6,24 +6,24 @@ from functools import partial
 from itertools import islice
 from typing import TYPE_CHECKING
 
-from sidecar.core.base.slices import in_groups
-from sidecar.core.message.outbound import OutboundMessage
-from sidecar.core.message.repair import repair_symbols, worth_a_copy
-from sidecar.core.seam.links import FragmentsLost, Resend, Send, SendAbandon
-from sidecar.core.transfer.room import Room
-from sidecar.core.wire.frame import symbol_count
+from plr.sidecar.core.base.slices import in_groups
+from plr.sidecar.core.message.outbound import OutboundMessage
+from plr.sidecar.core.message.repair import repair_symbols, worth_a_copy
+from plr.sidecar.core.seam.links import FragmentsLost, Resend, Send, SendAbandon
+from plr.sidecar.core.transfer.room import Room
+from plr.sidecar.core.wire.frame import symbol_count
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from protos.model.ids import InterfaceName, NodeName
-    from sidecar.core.base.slices import Step
-    from sidecar.core.base.values import PathId, Priority, RequestId
-    from sidecar.core.message.repair import Redundancy
-    from sidecar.core.seam.links import PathCommand
-    from sidecar.core.seam.stats import EngineStats
-    from sidecar.core.transfer.routes import Routes
-    from sidecar.core.wire.messages import Encoded
+    from plr.protos.model.ids import InterfaceName, NodeName
+    from plr.sidecar.core.base.slices import Step
+    from plr.sidecar.core.base.values import PathId, Priority, RequestId
+    from plr.sidecar.core.message.repair import Redundancy
+    from plr.sidecar.core.seam.links import PathCommand
+    from plr.sidecar.core.seam.stats import EngineStats
+    from plr.sidecar.core.transfer.routes import Routes
+    from plr.sidecar.core.wire.messages import Encoded
 
 LOOKED_AT_ONCE = 512
 """Messages that one call of `ask_again` looks at, under the engine's lock: about a millisecond."""

@@ -10,13 +10,13 @@ from __future__ import annotations
 import enum
 from typing import TYPE_CHECKING
 
-from sidecar.core.base.fair_share import Shares
-from sidecar.core.wire.frame import BASE_SYMBOL_BYTES
+from plr.sidecar.core.base.fair_share import Shares
+from plr.sidecar.core.wire.frame import BASE_SYMBOL_BYTES
 
 if TYPE_CHECKING:
-    from protos.model.ids import NodeName
-    from sidecar.core.base.values import PathId
-    from sidecar.core.message.outbound import OutboundMessage
+    from plr.protos.model.ids import NodeName
+    from plr.sidecar.core.base.values import PathId
+    from plr.sidecar.core.message.outbound import OutboundMessage
 
 MAX_MESSAGES = 16_384
 """All undelivered messages; one peer may have half of them, as many as requests may be in flight."""

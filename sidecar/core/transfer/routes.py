@@ -7,14 +7,14 @@ from dataclasses import dataclass, field
 from operator import attrgetter
 from typing import TYPE_CHECKING
 
-from sidecar.core.base.values import PathId, PathState
-from sidecar.core.message.repair import Loss, LossEstimate
-from sidecar.core.wire.frame import BASE_BYTES, FRAGMENT_OVERHEAD_BYTES
+from plr.sidecar.core.base.values import PathId, PathState
+from plr.sidecar.core.message.repair import Loss, LossEstimate
+from plr.sidecar.core.wire.frame import BASE_BYTES, FRAGMENT_OVERHEAD_BYTES
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
 
-    from protos.model.ids import InterfaceName, NodeName
+    from plr.protos.model.ids import InterfaceName, NodeName
 
 _order = attrgetter("order")
 _RANK = {PathState.UP: 0, PathState.UNSTABLE: 1, PathState.DOWN: 2}

@@ -11,7 +11,7 @@ import heapq
 from itertools import count
 from typing import TYPE_CHECKING, Generic, NamedTuple, TypeVar
 
-from sidecar.core.base.values import SHARE, Priority
+from plr.sidecar.core.base.values import SHARE, Priority
 
 if TYPE_CHECKING:
     from collections.abc import Hashable

@@ -50,9 +50,9 @@ from __future__ import annotations
 import struct
 from typing import TYPE_CHECKING, NamedTuple
 
-from protos.base.errors import DecodeError
-from protos.model.ids import OLDEST_PROTOCOL_VERSION, PROTOCOL_VERSION, InterfaceId, SessionId
-from sidecar.core.crypto.aead import NONCE_BYTES, TAG_BYTES
+from plr.protos.base.errors import DecodeError
+from plr.protos.model.ids import OLDEST_PROTOCOL_VERSION, PROTOCOL_VERSION, InterfaceId, SessionId
+from plr.sidecar.core.crypto.aead import NONCE_BYTES, TAG_BYTES
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

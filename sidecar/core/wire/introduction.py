@@ -7,11 +7,11 @@ Layout: the 20 clear bytes of every datagram (flags bit 2 set), then::
              credential (protos/trust/credential.py)
     tag (16 bytes)
 
-The token is the sender's for this receiver (`protos.trust.pair_token`): stable, and known to these two and the control
-plane alone. It is a gate at which a stranger's datagram costs one table lookup. Behind it, ChaCha20-Poly1305 takes its
-key from Expand(token, "plr 2 introduction" | session | sender's interface | receiver's interface | receiver's name),
-the clear bytes and the hello id as associated data, and the nonce of every datagram (frame.py). So there is one key for
-each path of a session, on which packet numbers do not repeat.
+The token is the sender's for this receiver (`plr.protos.trust.pair_token`): stable, and known to these two and the
+control plane alone. It is a gate at which a stranger's datagram costs one table lookup. Behind it, ChaCha20-Poly1305
+takes its key from Expand(token, "plr 2 introduction" | session | sender's interface | receiver's interface | receiver's
+name), the clear bytes and the hello id as associated data, and the nonce of every datagram (frame.py). So there is one
+key for each path of a session, on which packet numbers do not repeat.
 
 The control plane knows the token too, and so does anyone who reads the receiver's state folder. So an introduction
 proves little: the signed credential names the sender, and the sealed datagrams that follow prove that it has the
@@ -30,11 +30,11 @@ from typing import TYPE_CHECKING, NamedTuple
 from cryptography.exceptions import InvalidTag
 from cryptography.hazmat.primitives.ciphers.aead import ChaCha20Poly1305
 
-from protos.base.errors import DecodeError
-from protos.trust.credential import decode_credential
-from sidecar.core.crypto.aead import TAG_BYTES
-from sidecar.core.crypto.key_schedule import expand
-from sidecar.core.wire.frame import (
+from plr.protos.base.errors import DecodeError
+from plr.protos.trust.credential import decode_credential
+from plr.sidecar.core.crypto.aead import TAG_BYTES
+from plr.sidecar.core.crypto.key_schedule import expand
+from plr.sidecar.core.wire.frame import (
     BASE_BYTES,
     HEADER_BYTES,
     INTRODUCTION_FLAG,
@@ -46,8 +46,8 @@ from sidecar.core.wire.frame import (
 )
 
 if TYPE_CHECKING:
-    from protos.model.ids import NodeName
-    from protos.trust.credential import SessionCredential
+    from plr.protos.model.ids import NodeName
+    from plr.protos.trust.credential import SessionCredential
 
 HELLO_BYTES = 8
 INTRODUCTION_FLAGS = SEALED_FLAG | INTRODUCTION_FLAG

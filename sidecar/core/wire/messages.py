@@ -25,13 +25,13 @@ import struct
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, NamedTuple
 
-from protos.base.errors import DecodeError, UnknownKindError
-from protos.convert.fields import MAX_CRL_BYTES
-from protos.model.ids import ServiceName
-from protos.model.names import clean_text
-from protos.trust.identity import MAX_CA_CERTIFICATES
-from sidecar.core.base.request_id import REQUEST_ID_BYTES
-from sidecar.core.base.values import Priority, RejectReason, RequestId
+from plr.protos.base.errors import DecodeError, UnknownKindError
+from plr.protos.convert.fields import MAX_CRL_BYTES
+from plr.protos.model.ids import ServiceName
+from plr.protos.model.names import clean_text
+from plr.protos.trust.identity import MAX_CA_CERTIFICATES
+from plr.sidecar.core.base.request_id import REQUEST_ID_BYTES
+from plr.sidecar.core.base.values import Priority, RejectReason, RequestId
 
 if TYPE_CHECKING:
     from collections.abc import Callable

@@ -6,30 +6,30 @@ import logging
 import time
 from typing import TYPE_CHECKING
 
-from protos.model.members import ServiceOffer
-from sidecar.core.base.fair_share import Shares
-from sidecar.core.base.values import RejectReason
-from sidecar.core.rules.service_rule import Rules
-from sidecar.core.seam.application import AbandonExecution, CallsForbidden, CancelExecution, ExecuteRequest
-from sidecar.ros.cloud.roll_call import POLL_S, RollCall
-from sidecar.ros.cloud.server_processes import ServerProcesses
-from sidecar.ros.cloud.service_runner import Execution, ServiceRunner
-from sidecar.ros.errors import RosBridgeError
-from sidecar.ros.graph import graph
-from sidecar.ros.graph.node_names import NodeNames
-from sidecar.ros.types import TypeNotInstalledError, load_service_type
+from plr.protos.model.members import ServiceOffer
+from plr.sidecar.core.base.fair_share import Shares
+from plr.sidecar.core.base.values import RejectReason
+from plr.sidecar.core.rules.service_rule import Rules
+from plr.sidecar.core.seam.application import AbandonExecution, CallsForbidden, CancelExecution, ExecuteRequest
+from plr.sidecar.ros.cloud.roll_call import POLL_S, RollCall
+from plr.sidecar.ros.cloud.server_processes import ServerProcesses
+from plr.sidecar.ros.cloud.service_runner import Execution, ServiceRunner
+from plr.sidecar.ros.errors import RosBridgeError
+from plr.sidecar.ros.graph import graph
+from plr.sidecar.ros.graph.node_names import NodeNames
+from plr.sidecar.ros.types import TypeNotInstalledError, load_service_type
 
 if TYPE_CHECKING:
     from collections.abc import Generator, Iterator
 
-    from protos.model.ids import ServiceName
-    from sidecar.core.base.values import ExecutionId
-    from sidecar.core.rules.service_rule import ServiceRule
-    from sidecar.core.seam.application import ApplicationEvent
-    from sidecar.ports import DataPlane
-    from sidecar.ros.log_limit import LimitedLog
-    from sidecar.ros.ros_loop import RosLoop
-    from sidecar.ros.stats import BridgeStats
+    from plr.protos.model.ids import ServiceName
+    from plr.sidecar.core.base.values import ExecutionId
+    from plr.sidecar.core.rules.service_rule import ServiceRule
+    from plr.sidecar.core.seam.application import ApplicationEvent
+    from plr.sidecar.ports import DataPlane
+    from plr.sidecar.ros.log_limit import LimitedLog
+    from plr.sidecar.ros.ros_loop import RosLoop
+    from plr.sidecar.ros.stats import BridgeStats
 
 MAX_EXECUTIONS = 4096
 """Requests at local servers or waiting for them; one robot may have half. Further ones are refused as OVERLOADED, so

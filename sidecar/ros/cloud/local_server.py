@@ -4,18 +4,18 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from sidecar.ros.cloud.server_capacity import MOST_AT_ONCE
-from sidecar.ros.errors import RosBridgeError
-from sidecar.ros.graph import graph
-from sidecar.ros.rcl import Message, send_request, take_response
-from sidecar.ros.ros_loop import service_qos
+from plr.sidecar.ros.cloud.server_capacity import MOST_AT_ONCE
+from plr.sidecar.ros.errors import RosBridgeError
+from plr.sidecar.ros.graph import graph
+from plr.sidecar.ros.rcl import Message, send_request, take_response
+from plr.sidecar.ros.ros_loop import service_qos
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
-    from protos.model.ids import ServiceName
-    from sidecar.ros.graph.graph import NameOf
-    from sidecar.ros.types import ServiceType
+    from plr.protos.model.ids import ServiceName
+    from plr.sidecar.ros.graph.graph import NameOf
+    from plr.sidecar.ros.types import ServiceType
 
 TAKEN_AT_ONCE = 32
 """Answers taken from one server before the next has its turn."""

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import math
 
-from sidecar.ros.cloud.service_times import ServiceTimes
+from plr.sidecar.ros.cloud.service_times import ServiceTimes
 
 FEWER = 4
 """A trial divides the requests in work at once by this."""

@@ -14,7 +14,7 @@ import re
 import select
 from pathlib import Path
 
-from sidecar.ros.cloud.dds_id import pid_bits
+from plr.sidecar.ros.cloud.dds_id import pid_bits
 
 PORT_BASE = 7400
 PORTS_PER_DOMAIN = 250

@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 from itertools import count
 from typing import TYPE_CHECKING, Generic, TypeVar
 
-from sidecar.core.base.values import Priority
+from plr.sidecar.core.base.values import Priority
 
 if TYPE_CHECKING:
     from collections.abc import Hashable

@@ -23,13 +23,13 @@ from __future__ import annotations
 from collections import deque
 from typing import TYPE_CHECKING, Generic, TypeVar
 
-from sidecar.ros.cloud.server_capacity import FIRST_LIMIT, SAFE_SIZE, ServerCapacity
-from sidecar.ros.cloud.shared_queue import SharedQueue
+from plr.sidecar.ros.cloud.server_capacity import FIRST_LIMIT, SAFE_SIZE, ServerCapacity
+from plr.sidecar.ros.cloud.shared_queue import SharedQueue
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Hashable, Iterator
 
-    from sidecar.core.base.values import Priority
+    from plr.sidecar.core.base.values import Priority
 
 STALL_TIMES = 3.0
 """A silence lasts this many times the usual time of the server's requests ..."""

@@ -8,9 +8,9 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING, Any
 
-from sidecar.ros.cloud.dds_id import participant_of
-from sidecar.ros.graph.discovery_topic import DiscoveryTopic
-from sidecar.ros.graph.participant_info import speaker
+from plr.sidecar.ros.cloud.dds_id import participant_of
+from plr.sidecar.ros.graph.discovery_topic import DiscoveryTopic
+from plr.sidecar.ros.graph.participant_info import speaker
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable

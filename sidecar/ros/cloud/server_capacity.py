@@ -19,9 +19,9 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from sidecar.ros.cloud.overlap_gain import OverlapGain
-from sidecar.ros.cloud.request_overlap import RequestOverlap
-from sidecar.ros.cloud.service_times import ServiceTimes
+from plr.sidecar.ros.cloud.overlap_gain import OverlapGain
+from plr.sidecar.ros.cloud.request_overlap import RequestOverlap
+from plr.sidecar.ros.cloud.service_times import ServiceTimes
 
 FIRST_LIMIT = 2
 """One in work and one ready when that is done."""

@@ -12,8 +12,8 @@ import threading
 from collections import deque
 from typing import TYPE_CHECKING
 
-from sidecar.ros.cloud.dds_id import pid_bits, process_of
-from sidecar.ros.cloud.process_finder import has_ended, open_process, wants_processor
+from plr.sidecar.ros.cloud.dds_id import pid_bits, process_of
+from plr.sidecar.ros.cloud.process_finder import has_ended, open_process, wants_processor
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection

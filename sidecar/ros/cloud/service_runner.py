@@ -6,18 +6,18 @@ from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
-from sidecar.ros.cloud.local_server import LocalServer
-from sidecar.ros.cloud.request_window import RequestWindow
-from sidecar.ros.errors import RosBridgeError
+from plr.sidecar.ros.cloud.local_server import LocalServer
+from plr.sidecar.ros.cloud.request_window import RequestWindow
+from plr.sidecar.ros.errors import RosBridgeError
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from protos.model.ids import NodeName, ServiceName
-    from sidecar.core.base.values import ExecutionId, Priority
-    from sidecar.ros.graph.graph import NameOf
-    from sidecar.ros.rcl import Message
-    from sidecar.ros.types import ServiceType
+    from plr.protos.model.ids import NodeName, ServiceName
+    from plr.sidecar.core.base.values import ExecutionId, Priority
+    from plr.sidecar.ros.graph.graph import NameOf
+    from plr.sidecar.ros.rcl import Message
+    from plr.sidecar.ros.types import ServiceType
 
 
 @dataclass(slots=True, eq=False)

@@ -11,12 +11,12 @@ from __future__ import annotations
 from collections import OrderedDict
 from typing import TYPE_CHECKING, Generic, TypeVar
 
-from sidecar.ros.cloud.request_queue import RequestQueue
+from plr.sidecar.ros.cloud.request_queue import RequestQueue
 
 if TYPE_CHECKING:
     from collections.abc import Hashable
 
-    from sidecar.core.base.values import Priority
+    from plr.sidecar.core.base.values import Priority
 
 SHARED_ONE_IN = 4
 """One turn in this many goes by robots."""

@@ -11,9 +11,9 @@ import importlib
 import logging
 from typing import TYPE_CHECKING, Any
 
-from sidecar.ros.errors import RosBridgeError
-from sidecar.ros.graph.graph import PARTICIPANTS_TOPIC
-from sidecar.ros.rcl import LatchedTopic, MessageType
+from plr.sidecar.ros.errors import RosBridgeError
+from plr.sidecar.ros.graph.graph import PARTICIPANTS_TOPIC
+from plr.sidecar.ros.rcl import LatchedTopic, MessageType
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

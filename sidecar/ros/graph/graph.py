@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from rclpy.impl.implementation_singleton import rclpy_implementation as _rclpy
 
-from protos.model.ids import ServiceName
+from plr.protos.model.ids import ServiceName
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Generator, Mapping

@@ -7,15 +7,15 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from sidecar.core.rules.service_rule import Rules
-from sidecar.ros.errors import RosBridgeError
-from sidecar.ros.types import load_service_type
+from plr.sidecar.core.rules.service_rule import Rules
+from plr.sidecar.ros.errors import RosBridgeError
+from plr.sidecar.ros.types import load_service_type
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
-    from protos.model.members import Peer
-    from sidecar.core.rules.service_rule import ServiceRule
+    from plr.protos.model.members import Peer
+    from plr.sidecar.core.rules.service_rule import ServiceRule
 
 MAX_LINES = 10
 

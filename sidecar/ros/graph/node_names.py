@@ -5,14 +5,14 @@ from __future__ import annotations
 import logging
 from typing import TYPE_CHECKING, Any
 
-from sidecar.ros.errors import RosBridgeError
-from sidecar.ros.graph.discovery_topic import DiscoveryTopic
-from sidecar.ros.graph.participant_info import speaker
-from sidecar.ros.graph.unknown_nodes import UnknownNodes
+from plr.sidecar.ros.errors import RosBridgeError
+from plr.sidecar.ros.graph.discovery_topic import DiscoveryTopic
+from plr.sidecar.ros.graph.participant_info import speaker
+from plr.sidecar.ros.graph.unknown_nodes import UnknownNodes
 
 if TYPE_CHECKING:
-    from sidecar.ros.log_limit import LimitedLog
-    from sidecar.ros.stats import BridgeStats
+    from plr.sidecar.ros.log_limit import LimitedLog
+    from plr.sidecar.ros.stats import BridgeStats
 
 CALL_S = 0.7
 """How long a call waits for the participants it asks."""

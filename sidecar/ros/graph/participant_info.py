@@ -16,8 +16,8 @@ import re
 import struct
 from typing import TYPE_CHECKING
 
-from sidecar.ros.cloud.dds_id import ENDPOINT_BYTES, PARTICIPANT_BYTES
-from sidecar.ros.errors import RosBridgeError
+from plr.sidecar.ros.cloud.dds_id import ENDPOINT_BYTES, PARTICIPANT_BYTES
+from plr.sidecar.ros.errors import RosBridgeError
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

@@ -12,8 +12,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from sidecar.ros.cloud.dds_id import participant_of
-from sidecar.ros.graph.participant_info import nodes_of, speaker
+from plr.sidecar.ros.cloud.dds_id import participant_of
+from plr.sidecar.ros.graph.participant_info import nodes_of, speaker
 
 UNKNOWN_FOR_S = 1.0
 """How long rmw must not have known the node of an endpoint before its process is asked. Also the least time between two

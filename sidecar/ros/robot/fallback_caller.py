@@ -1,6 +1,6 @@
 """Finds and calls the local services of a robot that stand in for the network.
 
-`sidecar.core.robot.fallback.fallbacks` decides when they are called, and which answer counts.
+`plr.sidecar.core.robot.fallback.fallbacks` decides when they are called, and which answer counts.
 """
 
 from __future__ import annotations
@@ -9,24 +9,24 @@ import logging
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from sidecar.core.robot.fallback.fallbacks import Fallbacks
-from sidecar.ros.cloud.local_server import LocalServer
-from sidecar.ros.errors import RosBridgeError
-from sidecar.ros.types import load_service_type
+from plr.sidecar.core.robot.fallback.fallbacks import Fallbacks
+from plr.sidecar.ros.cloud.local_server import LocalServer
+from plr.sidecar.ros.errors import RosBridgeError
+from plr.sidecar.ros.types import load_service_type
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping
 
-    from protos.model.ids import ServiceName
-    from sidecar.core.base.values import RequestId
-    from sidecar.core.robot.fallback.fallbacks import FallbackCall
-    from sidecar.core.rules.service_rule import ServiceRule
-    from sidecar.core.seam.application import RequestFailed
-    from sidecar.ros.cloud.server_processes import ServerProcesses
-    from sidecar.ros.graph.graph import NameOf, Served
-    from sidecar.ros.log_limit import LimitedLog
-    from sidecar.ros.ros_loop import RosLoop
-    from sidecar.ros.stats import BridgeStats
+    from plr.protos.model.ids import ServiceName
+    from plr.sidecar.core.base.values import RequestId
+    from plr.sidecar.core.robot.fallback.fallbacks import FallbackCall
+    from plr.sidecar.core.rules.service_rule import ServiceRule
+    from plr.sidecar.core.seam.application import RequestFailed
+    from plr.sidecar.ros.cloud.server_processes import ServerProcesses
+    from plr.sidecar.ros.graph.graph import NameOf, Served
+    from plr.sidecar.ros.log_limit import LimitedLog
+    from plr.sidecar.ros.ros_loop import RosLoop
+    from plr.sidecar.ros.stats import BridgeStats
 
 MAX_ASKED = 64
 """Requests whose number at one fallback is remembered; beyond this the oldest, lost long ago, is forgotten."""

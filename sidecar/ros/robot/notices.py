@@ -12,7 +12,7 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
 
 if TYPE_CHECKING:
-    from sidecar.core.seam.application import DeadlineMissed, RequestFailed
+    from plr.sidecar.core.seam.application import DeadlineMissed, RequestFailed
 
 DEADLINE_TOPIC = "/plr/deadline_missed"
 FAILURE_TOPIC = "/plr/request_failed"

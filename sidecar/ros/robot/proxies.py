@@ -5,21 +5,21 @@ from __future__ import annotations
 import logging
 from typing import TYPE_CHECKING
 
-from sidecar.core.rules.service_rule import Rules
-from sidecar.ros.errors import RosBridgeError
-from sidecar.ros.graph import graph
-from sidecar.ros.robot.service_proxy import ServiceProxy
-from sidecar.ros.types import TypeNotInstalledError, load_service_type
+from plr.sidecar.core.rules.service_rule import Rules
+from plr.sidecar.ros.errors import RosBridgeError
+from plr.sidecar.ros.graph import graph
+from plr.sidecar.ros.robot.service_proxy import ServiceProxy
+from plr.sidecar.ros.types import TypeNotInstalledError, load_service_type
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping
 
-    from protos.model.ids import ServiceName
-    from sidecar.core.rules.service_rule import ServiceRule
-    from sidecar.core.seam.application import OfferService, WithdrawService
-    from sidecar.ros.rcl import RmwRequestId
-    from sidecar.ros.ros_loop import RosLoop
-    from sidecar.ros.stats import BridgeStats
+    from plr.protos.model.ids import ServiceName
+    from plr.sidecar.core.rules.service_rule import ServiceRule
+    from plr.sidecar.core.seam.application import OfferService, WithdrawService
+    from plr.sidecar.ros.rcl import RmwRequestId
+    from plr.sidecar.ros.ros_loop import RosLoop
+    from plr.sidecar.ros.stats import BridgeStats
 
 DISCOVERY_SETTLES_S = 1.0
 """How long nothing is offered after joining the domain: servers already running here must be discovered first."""

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from sidecar.core.base.request_id import make_request_id
+from plr.sidecar.core.base.request_id import make_request_id
 
 if TYPE_CHECKING:
-    from protos.model.ids import SessionId
-    from sidecar.core.base.values import RequestId
-    from sidecar.ros.rcl import RmwRequestId
+    from plr.protos.model.ids import SessionId
+    from plr.sidecar.core.base.values import RequestId
+    from plr.sidecar.ros.rcl import RmwRequestId
 
 
 class RequestNumbering:

@@ -7,7 +7,7 @@ import time
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from sidecar.core.seam.application import (
+from plr.sidecar.core.seam.application import (
     DeadlineMissed,
     OfferService,
     RequestFailed,
@@ -15,32 +15,32 @@ from sidecar.core.seam.application import (
     Unreachable,
     WithdrawService,
 )
-from sidecar.ros.cloud.server_processes import ServerProcesses
-from sidecar.ros.errors import RosBridgeError
-from sidecar.ros.graph import graph
-from sidecar.ros.graph.node_names import NodeNames
-from sidecar.ros.rcl import NewClientError
-from sidecar.ros.robot.fallback_caller import FallbackCaller
-from sidecar.ros.robot.new_clients import GIVE_UP_S, NewClients
-from sidecar.ros.robot.notices import NoticePublisher
-from sidecar.ros.robot.proxies import Proxies
-from sidecar.ros.robot.reply_pacer import ReplyPacer
-from sidecar.ros.robot.request_numbering import RequestNumbering
+from plr.sidecar.ros.cloud.server_processes import ServerProcesses
+from plr.sidecar.ros.errors import RosBridgeError
+from plr.sidecar.ros.graph import graph
+from plr.sidecar.ros.graph.node_names import NodeNames
+from plr.sidecar.ros.rcl import NewClientError
+from plr.sidecar.ros.robot.fallback_caller import FallbackCaller
+from plr.sidecar.ros.robot.new_clients import GIVE_UP_S, NewClients
+from plr.sidecar.ros.robot.notices import NoticePublisher
+from plr.sidecar.ros.robot.proxies import Proxies
+from plr.sidecar.ros.robot.reply_pacer import ReplyPacer
+from plr.sidecar.ros.robot.request_numbering import RequestNumbering
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from protos.model.ids import ServiceName
-    from sidecar.core.base.values import RequestId
-    from sidecar.core.rules.service_rule import ServiceRule
-    from sidecar.core.seam.application import ApplicationEvent
-    from sidecar.ports import DataPlane
-    from sidecar.ros.log_limit import LimitedLog
-    from sidecar.ros.rcl import Message, RmwRequestId
-    from sidecar.ros.robot.fallback_caller import FallbackAnswer
-    from sidecar.ros.robot.service_proxy import ServiceProxy
-    from sidecar.ros.ros_loop import RosLoop
-    from sidecar.ros.stats import BridgeStats
+    from plr.protos.model.ids import ServiceName
+    from plr.sidecar.core.base.values import RequestId
+    from plr.sidecar.core.rules.service_rule import ServiceRule
+    from plr.sidecar.core.seam.application import ApplicationEvent
+    from plr.sidecar.ports import DataPlane
+    from plr.sidecar.ros.log_limit import LimitedLog
+    from plr.sidecar.ros.rcl import Message, RmwRequestId
+    from plr.sidecar.ros.robot.fallback_caller import FallbackAnswer
+    from plr.sidecar.ros.robot.service_proxy import ServiceProxy
+    from plr.sidecar.ros.ros_loop import RosLoop
+    from plr.sidecar.ros.stats import BridgeStats
 
 MAX_PENDING_REQUESTS = 4096
 """Application requests without an answer; beyond this, new ones are dropped, as an older one may still be in time."""

@@ -4,15 +4,15 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from sidecar.ros.errors import RosBridgeError
-from sidecar.ros.rcl import Message, RmwRequestId, send_response, take_request
-from sidecar.ros.ros_loop import service_qos
+from plr.sidecar.ros.errors import RosBridgeError
+from plr.sidecar.ros.rcl import Message, RmwRequestId, send_response, take_request
+from plr.sidecar.ros.ros_loop import service_qos
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from protos.model.ids import ServiceName
-    from sidecar.ros.types import ServiceType
+    from plr.protos.model.ids import ServiceName
+    from plr.sidecar.ros.types import ServiceType
 
 QUEUE_DEPTH = 1024
 """Requests that rmw keeps until the loop takes them; with the default of 10, some of 100 sent at once are lost."""

@@ -5,8 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 
 from bench.null_cipher import NullCipher, null_cipher
-from protos.trust.credential import Aead
-from sidecar.core.crypto import aead
+from plr.protos.trust.credential import Aead
+from plr.sidecar.core.crypto import aead
 
 ROOT = Path(__file__).parents[3]
 

@@ -6,10 +6,10 @@ from __future__ import annotations
 import random
 from typing import TYPE_CHECKING
 
-from protos.base.histogram import Histogram
-from protos.model.ids import InterfaceName, NodeName, ServiceName
-from protos.model.mapping import Assignment
-from protos.model.report import (
+from plr.protos.base.histogram import Histogram
+from plr.protos.model.ids import InterfaceName, NodeName, ServiceName
+from plr.protos.model.mapping import Assignment
+from plr.protos.model.report import (
     InterfaceJointReport,
     JointReport,
     LatencyReport,

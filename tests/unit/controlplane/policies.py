@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from hypothesis import strategies as st
 
-from controlplane.core.policy.policy import CallRule, OfferRule, Policy
+from plr.controlplane.core.policy.policy import CallRule, OfferRule, Policy
 
 ROBOTS = ("robot", "robot-2", "arm-1")
 CLOUDS = ("a", "b", "cloud-c")

@@ -7,10 +7,10 @@ import math
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
-from controlplane.core.problem.costs import RULE_PRICE, TIE_PRICE
-from controlplane.core.problem.objectives import PROBABILITY_FLOOR
-from controlplane.core.problem.plan import Price
-from controlplane.core.problem.problem import (
+from plr.controlplane.core.problem.costs import RULE_PRICE, TIE_PRICE
+from plr.controlplane.core.problem.objectives import PROBABILITY_FLOOR
+from plr.controlplane.core.problem.plan import Price
+from plr.controlplane.core.problem.problem import (
     Block,
     BlockKey,
     Choice,
@@ -23,8 +23,8 @@ from controlplane.core.problem.problem import (
     fleet_excess,
     is_valid,
 )
-from protos.model.ids import InterfaceName, NodeName, ServiceName
-from protos.model.members import AT_MOST_EVERY_INTERFACE, EVERY_INTERFACE, Copies
+from plr.protos.model.ids import InterfaceName, NodeName, ServiceName
+from plr.protos.model.members import AT_MOST_EVERY_INTERFACE, EVERY_INTERFACE, Copies
 
 if TYPE_CHECKING:
     import random

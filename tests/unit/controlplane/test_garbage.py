@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from controlplane.garbage import MEMBER_BYTES, ROOM_BYTES, GarbageWatch
+from plr.controlplane.garbage import MEMBER_BYTES, ROOM_BYTES, GarbageWatch
 
 MB = 1024 * 1024
 

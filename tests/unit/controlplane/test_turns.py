@@ -6,8 +6,8 @@ import asyncio
 
 import pytest
 
-from controlplane import turns
-from controlplane.turns import Turns
+from plr.controlplane import turns
+from plr.controlplane.turns import Turns
 
 pytestmark = pytest.mark.audit("ops-19")
 

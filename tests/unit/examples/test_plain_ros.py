@@ -9,7 +9,7 @@ import pytest
 
 EXAMPLES = Path(__file__).parents[3] / "examples"
 SOURCES = sorted(EXAMPLES.rglob("*.py"))
-OURS = {"sidecar", "controlplane", "protos", "lab", "bench", "tests"}
+OURS = {"plr", "sidecar", "controlplane", "protos", "lab", "bench", "tests"}
 
 
 def imported(source: str) -> set[str]:
@@ -30,4 +30,4 @@ def test_an_example_imports_nothing_of_ours(path: Path) -> None:
 
 def test_the_check_would_find_such_an_import() -> None:
     assert len(SOURCES) >= 10
-    assert imported("def f():\n    from sidecar.core import engine\n    import protos.model") == {"sidecar", "protos"}
+    assert imported("def f():\n    from plr.sidecar.core import engine\n    import lab.system") == {"plr", "lab"}

@@ -8,12 +8,12 @@ from typing import TypeVar
 
 from hypothesis import strategies as st
 
-from protos.base.histogram import BUCKETS, MAX_COUNT, Histogram
-from protos.base.size_class import SIZE_CLASSES
-from protos.convert.control import MAX_WALL_S
-from protos.convert.fields import MAX_CAPACITY, MAX_CHARGE, MAX_COPIES, MAX_DURATION_S, MAX_EVENTS
-from protos.convert.types import LEAST_TARGET
-from protos.model.explanation import (
+from plr.protos.base.histogram import BUCKETS, MAX_COUNT, Histogram
+from plr.protos.base.size_class import SIZE_CLASSES
+from plr.protos.convert.control import MAX_WALL_S
+from plr.protos.convert.fields import MAX_CAPACITY, MAX_CHARGE, MAX_COPIES, MAX_DURATION_S, MAX_EVENTS
+from plr.protos.convert.types import LEAST_TARGET
+from plr.protos.model.explanation import (
     Alternative,
     AlternativeKind,
     Belief,
@@ -23,8 +23,8 @@ from protos.model.explanation import (
     MappingChange,
     PairExplanation,
 )
-from protos.model.fleet_events import DepartedSidecar, EventKind, EventLogState, FleetEvent, Why
-from protos.model.ids import (
+from plr.protos.model.fleet_events import DepartedSidecar, EventKind, EventLogState, FleetEvent, Why
+from plr.protos.model.ids import (
     MAX_VERSION,
     PROTOCOL_VERSION,
     Address,
@@ -36,8 +36,8 @@ from protos.model.ids import (
     SessionId,
     Version,
 )
-from protos.model.mapping import Assignment, MappingSet, ServiceMapping
-from protos.model.members import (
+from plr.protos.model.mapping import Assignment, MappingSet, ServiceMapping
+from plr.protos.model.members import (
     ALL_CALLS,
     MAX_CREDENTIAL_BYTES,
     MAX_SIGNATURE_BYTES,
@@ -59,8 +59,8 @@ from protos.model.members import (
     ServiceSet,
     ServiceUse,
 )
-from protos.model.redundancy_mode import RedundancyMode
-from protos.model.report import (
+from plr.protos.model.redundancy_mode import RedundancyMode
+from plr.protos.model.report import (
     InterfaceJointReport,
     JointReport,
     LatencyReport,
@@ -69,8 +69,8 @@ from protos.model.report import (
     PenaltyReport,
     Report,
 )
-from protos.model.status import ResourceStatus, SidecarStatus, SyncState
-from protos.model.stream import Ack, ControlMessage, Drain, Heartbeat, Nack, ResourceKind, SidecarMessage, Welcome
+from plr.protos.model.status import ResourceStatus, SidecarStatus, SyncState
+from plr.protos.model.stream import Ack, ControlMessage, Drain, Heartbeat, Nack, ResourceKind, SidecarMessage, Welcome
 
 T = TypeVar("T")
 

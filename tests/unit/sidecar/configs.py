@@ -6,7 +6,7 @@ from typing import Any
 
 import yaml
 
-from sidecar.config.sidecar import SidecarConfig, parse_config
+from plr.sidecar.config.sidecar import SidecarConfig, parse_config
 
 SOURCE = "sidecar.yaml"
 ROBOT: dict[str, Any] = {

@@ -5,12 +5,12 @@ from __future__ import annotations
 import random
 from typing import TYPE_CHECKING
 
-from protos.stun.codec import MessageClass, StunMessage, decode, encode
-from sidecar.core.stun.client import StunClient
+from plr.protos.stun.codec import MessageClass, StunMessage, decode, encode
+from plr.sidecar.core.stun.client import StunClient
 
 if TYPE_CHECKING:
-    from sidecar.core.stun.events import StunEvent
-    from sidecar.core.stun.family import StunClientConfig
+    from plr.sidecar.core.stun.events import StunEvent
+    from plr.sidecar.core.stun.family import StunClientConfig
 
 A = ("192.0.2.1", 3478)
 B = ("192.0.2.2", 3478)

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from sidecar.__main__ import main
+from plr.sidecar.__main__ import main
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -45,7 +45,7 @@ def test_a_deadline_in_seconds_is_doubted(
         "name: robot-1\nrole: robot\ninsecure: true\ncontrol_plane: 127.0.0.1:1\ninterfaces: [lo]\n"
         f"state_dir: {tmp_path}\nservices: [{{name: /plan, deadline_ms: 100}}, {{name: /look, deadline_ms: 0.2}}]\n"
     )
-    monkeypatch.setattr("sidecar.ros.environment.problem", lambda **_: None)
+    monkeypatch.setattr("plr.sidecar.ros.environment.problem", lambda **_: None)
     assert main(["--config", str(config), "--check-config"]) == 0
     told = "0.2 ms is less than any network takes; the unit is milliseconds"
     assert capsys.readouterr().err == f"plr-sidecar: warning: services[1].deadline_ms: {told}\n"

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from sidecar.stop_request import StopRequest
+from plr.sidecar.stop_request import StopRequest
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

@@ -7,10 +7,10 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from sidecar.core.path.congestion.units import DATAGRAM_BYTES, END_HOST_S
+from plr.sidecar.core.path.congestion.units import DATAGRAM_BYTES, END_HOST_S
 
 if TYPE_CHECKING:
-    from sidecar.core.path.congestion.delivery_rate import DeliveryRate
+    from plr.sidecar.core.path.congestion.delivery_rate import DeliveryRate
 
 CYCLE = (1.25, 0.75, 1.0, 1.0, 1.0, 1.0, 1.0, 1.0)
 """Pacing gains round by round: send more, drain what that queued, cruise (BBR's ProbeBW)."""

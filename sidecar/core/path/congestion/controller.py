@@ -10,14 +10,14 @@ from __future__ import annotations
 from enum import Enum
 from typing import TYPE_CHECKING, NamedTuple
 
-from sidecar.core.path.congestion.bandwidth_search import BandwidthSearch, is_faster
-from sidecar.core.path.congestion.delivery_rate import DeliveryRate
-from sidecar.core.path.congestion.loss_ceiling import LossCeiling
-from sidecar.core.path.congestion.policer import Policer
-from sidecar.core.path.congestion.units import DATAGRAM_BYTES, END_HOST_S
+from plr.sidecar.core.path.congestion.bandwidth_search import BandwidthSearch, is_faster
+from plr.sidecar.core.path.congestion.delivery_rate import DeliveryRate
+from plr.sidecar.core.path.congestion.loss_ceiling import LossCeiling
+from plr.sidecar.core.path.congestion.policer import Policer
+from plr.sidecar.core.path.congestion.units import DATAGRAM_BYTES, END_HOST_S
 
 if TYPE_CHECKING:
-    from sidecar.core.path.congestion.rtt import RttEstimator
+    from plr.sidecar.core.path.congestion.rtt import RttEstimator
 
 INITIAL_WINDOW_BYTES = 32 * 1024
 """Bytes that may leave at once on an unknown path: within what browsers do (RFC 6928 says 14 kB for TCP), and such that

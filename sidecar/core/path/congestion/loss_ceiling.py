@@ -10,11 +10,11 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from sidecar.core.path.congestion.standing_queue import FloorChange, StandingQueue
-from sidecar.core.path.congestion.units import DATAGRAM_BYTES
+from plr.sidecar.core.path.congestion.standing_queue import FloorChange, StandingQueue
+from plr.sidecar.core.path.congestion.units import DATAGRAM_BYTES
 
 if TYPE_CHECKING:
-    from sidecar.core.path.congestion.rtt import RttEstimator
+    from plr.sidecar.core.path.congestion.rtt import RttEstimator
 
 CUT = 0.7
 """Share that a cut leaves (CUBIC's beta, RFC 9438 section 4.6)."""

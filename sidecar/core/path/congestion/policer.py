@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections import deque
 
-from sidecar.core.path.congestion.units import DATAGRAM_BYTES
+from plr.sidecar.core.path.congestion.units import DATAGRAM_BYTES
 
 SUSPECT_LOSS = 0.1
 """Losing this share is worth a trial. A sender that knows of no policer hardly loses less to it; radios mostly do."""

@@ -16,7 +16,7 @@ import enum
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from sidecar.core.path.congestion.rtt import RttEstimator
+    from plr.sidecar.core.path.congestion.rtt import RttEstimator
 
 LENGTH_FACTOR = 0.2
 """A round trip longer than the floor by this share, and by more than its variation, shows a queue."""

@@ -12,13 +12,13 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING
 
-from sidecar.core.base.values import PathState
+from plr.sidecar.core.base.values import PathState
 
 if TYPE_CHECKING:
-    from sidecar.core.base.values import PathId
-    from sidecar.core.robot.dispatch.pair_history import PathPaces
-    from sidecar.core.robot.request.request import Copy, Request
-    from sidecar.core.transfer.routes import Routes
+    from plr.sidecar.core.base.values import PathId
+    from plr.sidecar.core.robot.dispatch.pair_history import PathPaces
+    from plr.sidecar.core.robot.request.request import Copy, Request
+    from plr.sidecar.core.transfer.routes import Routes
 
 LOOKS = 20
 """Number of looks at a request until its deadline ..."""

@@ -9,17 +9,17 @@ from __future__ import annotations
 from collections import Counter
 from typing import TYPE_CHECKING
 
-from sidecar.core.transfer.room import Lane
-from sidecar.core.transfer.waiting_line import WaitingLine
+from plr.sidecar.core.transfer.room import Lane
+from plr.sidecar.core.transfer.waiting_line import WaitingLine
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
 
-    from protos.model.ids import NodeName
-    from sidecar.core.base.values import RequestId
-    from sidecar.core.robot.dispatch.dispatcher import Dispatching
-    from sidecar.core.robot.request.request import Request
-    from sidecar.core.transfer.routes import Routes
+    from plr.protos.model.ids import NodeName
+    from plr.sidecar.core.base.values import RequestId
+    from plr.sidecar.core.robot.dispatch.dispatcher import Dispatching
+    from plr.sidecar.core.robot.request.request import Request
+    from plr.sidecar.core.transfer.routes import Routes
 
     _Group = tuple[Lane, tuple[NodeName, ...]]
 

@@ -16,9 +16,9 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
-    from protos.model.ids import InterfaceName, ServiceName
-    from sidecar.core.rules.budget import Budget
-    from sidecar.core.seam.stats import EngineStats
+    from plr.protos.model.ids import InterfaceName, ServiceName
+    from plr.sidecar.core.rules.budget import Budget
+    from plr.sidecar.core.seam.stats import EngineStats
 
 MAX_SAVED_BYTES = 32 * 1024 * 1024
 """Capacity of a bucket: twice the largest request."""

@@ -5,17 +5,17 @@ from __future__ import annotations
 from collections import OrderedDict
 from typing import TYPE_CHECKING
 
-from sidecar.core.base.values import Priority
-from sidecar.core.robot.request.request import CopyState
-from sidecar.core.wire.messages import CancelMessage, encode_message
+from plr.sidecar.core.base.values import Priority
+from plr.sidecar.core.robot.request.request import CopyState
+from plr.sidecar.core.wire.messages import CancelMessage, encode_message
 
 if TYPE_CHECKING:
-    from protos.model.ids import NodeName
-    from sidecar.core.base.values import RequestId
-    from sidecar.core.robot.request.request import Copy, Request
-    from sidecar.core.seam.stats import EngineStats
-    from sidecar.core.transfer.outbox import Outbox
-    from sidecar.core.transfer.routes import Routes
+    from plr.protos.model.ids import NodeName
+    from plr.sidecar.core.base.values import RequestId
+    from plr.sidecar.core.robot.request.request import Copy, Request
+    from plr.sidecar.core.seam.stats import EngineStats
+    from plr.sidecar.core.transfer.outbox import Outbox
+    from plr.sidecar.core.transfer.routes import Routes
 
 MAX_CALLED_OFF = 1024
 """Most ids of requests with called-off copies, kept to tell answers that were on their way from strays."""

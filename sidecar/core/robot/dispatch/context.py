@@ -5,22 +5,22 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
-from sidecar.core.base.slices import Backlog
-from sidecar.core.robot.dispatch.penalties import Penalties
-from sidecar.core.robot.request.index import RequestIndex
+from plr.sidecar.core.base.slices import Backlog
+from plr.sidecar.core.robot.dispatch.penalties import Penalties
+from plr.sidecar.core.robot.request.index import RequestIndex
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from protos.model.ids import NodeName
-    from sidecar.core.robot.measure.measurements import Measurements
-    from sidecar.core.robot.request.mapping_table import MappingTable
-    from sidecar.core.robot.request.service_catalog import Offers
-    from sidecar.core.rules.budget import Budget
-    from sidecar.core.seam.application import ApplicationEvent
-    from sidecar.core.seam.stats import EngineStats
-    from sidecar.core.transfer.outbox import Outbox
-    from sidecar.core.transfer.routes import Routes
+    from plr.protos.model.ids import NodeName
+    from plr.sidecar.core.robot.measure.measurements import Measurements
+    from plr.sidecar.core.robot.request.mapping_table import MappingTable
+    from plr.sidecar.core.robot.request.service_catalog import Offers
+    from plr.sidecar.core.rules.budget import Budget
+    from plr.sidecar.core.seam.application import ApplicationEvent
+    from plr.sidecar.core.seam.stats import EngineStats
+    from plr.sidecar.core.transfer.outbox import Outbox
+    from plr.sidecar.core.transfer.routes import Routes
 
 
 @dataclass(frozen=True, slots=True)

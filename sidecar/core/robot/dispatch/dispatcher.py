@@ -9,22 +9,22 @@ from __future__ import annotations
 import enum
 from typing import TYPE_CHECKING
 
-from sidecar.core.base.values import PathState
-from sidecar.core.robot.dispatch.adaptive import Adaptive
-from sidecar.core.robot.dispatch.budgets import Budgets
-from sidecar.core.robot.dispatch.exploration import Exploration
-from sidecar.core.robot.dispatch.modes import MODES
-from sidecar.core.robot.dispatch.pair_history import PathPaces, PathRecords
-from sidecar.core.robot.request.request import Copy, CopyState, Request
-from sidecar.core.wire.messages import RequestMessage, encode_message
+from plr.sidecar.core.base.values import PathState
+from plr.sidecar.core.robot.dispatch.adaptive import Adaptive
+from plr.sidecar.core.robot.dispatch.budgets import Budgets
+from plr.sidecar.core.robot.dispatch.exploration import Exploration
+from plr.sidecar.core.robot.dispatch.modes import MODES
+from plr.sidecar.core.robot.dispatch.pair_history import PathPaces, PathRecords
+from plr.sidecar.core.robot.request.request import Copy, CopyState, Request
+from plr.sidecar.core.wire.messages import RequestMessage, encode_message
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterable
 
-    from protos.model.ids import NodeName
-    from sidecar.core.base.values import PathId
-    from sidecar.core.robot.dispatch.context import RequestParts
-    from sidecar.core.wire.messages import Encoded
+    from plr.protos.model.ids import NodeName
+    from plr.sidecar.core.base.values import PathId
+    from plr.sidecar.core.robot.dispatch.context import RequestParts
+    from plr.sidecar.core.wire.messages import Encoded
 
 MAX_COPIES = 8
 """Most copies of one request, including those sent in trouble."""

@@ -11,17 +11,17 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from sidecar.core.base.values import PathState
+from plr.sidecar.core.base.values import PathState
 
 if TYPE_CHECKING:
     from collections.abc import Collection
 
-    from protos.model.ids import NodeName, ServiceName
-    from sidecar.core.base.values import PathId
-    from sidecar.core.robot.request.mapping_table import MappingTable
-    from sidecar.core.robot.request.request import Request
-    from sidecar.core.transfer.outbox import Outbox
-    from sidecar.core.transfer.routes import Routes
+    from plr.protos.model.ids import NodeName, ServiceName
+    from plr.sidecar.core.base.values import PathId
+    from plr.sidecar.core.robot.request.mapping_table import MappingTable
+    from plr.sidecar.core.robot.request.request import Request
+    from plr.sidecar.core.transfer.outbox import Outbox
+    from plr.sidecar.core.transfer.routes import Routes
 
 MAX_PER_S = 0.2
 """Most such copies of one service per second: 12 a minute, however many requests there are."""

@@ -8,14 +8,14 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Protocol
 
-from protos.model.redundancy_mode import RedundancyMode
-from sidecar.core.robot.request.request import HEDGE_AT
+from plr.protos.model.redundancy_mode import RedundancyMode
+from plr.sidecar.core.robot.request.request import HEDGE_AT
 
 if TYPE_CHECKING:
-    from sidecar.core.base.values import PathId
-    from sidecar.core.robot.dispatch.adaptive import Adaptive
-    from sidecar.core.robot.dispatch.pair_history import PathRecords
-    from sidecar.core.robot.request.request import Request
+    from plr.sidecar.core.base.values import PathId
+    from plr.sidecar.core.robot.dispatch.adaptive import Adaptive
+    from plr.sidecar.core.robot.dispatch.pair_history import PathRecords
+    from plr.sidecar.core.robot.request.request import Request
 
 
 class Sender(Protocol):

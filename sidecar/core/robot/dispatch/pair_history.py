@@ -19,14 +19,14 @@ from collections import OrderedDict, deque
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, NamedTuple
 
-from sidecar.core.robot.request.request import CopyState
+from plr.sidecar.core.robot.request.request import CopyState
 
 if TYPE_CHECKING:
-    from protos.model.ids import InterfaceName, NodeName, ServiceName
-    from sidecar.core.base.values import PathId
-    from sidecar.core.robot.request.request import Copy, Request
-    from sidecar.core.seam.stats import EngineStats
-    from sidecar.core.transfer.routes import Routes
+    from plr.protos.model.ids import InterfaceName, NodeName, ServiceName
+    from plr.sidecar.core.base.values import PathId
+    from plr.sidecar.core.robot.request.request import Copy, Request
+    from plr.sidecar.core.seam.stats import EngineStats
+    from plr.sidecar.core.transfer.routes import Routes
 
 MAX_PACES = 4096
 """Pairs remembered, each for one service; beyond that the least recently used one goes."""

@@ -11,12 +11,12 @@ import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from protos.model.report import PenaltyReport
+from plr.protos.model.report import PenaltyReport
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
-    from protos.model.ids import NodeName
+    from plr.protos.model.ids import NodeName
 
 FIRST_S = 10.0
 """Time out of favour after the first bad answer ..."""

@@ -12,16 +12,16 @@ from __future__ import annotations
 import heapq
 from typing import TYPE_CHECKING, NamedTuple
 
-from protos.model.ids import ServiceName
-from sidecar.core.robot.fallback.queue import FallbackQueue, FallbackRequest
+from plr.protos.model.ids import ServiceName
+from plr.sidecar.core.robot.fallback.queue import FallbackQueue, FallbackRequest
 
 if TYPE_CHECKING:
     from collections import Counter
     from collections.abc import Iterable
 
-    from sidecar.core.base.values import RequestId
-    from sidecar.core.rules.service_rule import ServiceRule
-    from sidecar.core.seam.application import RequestFailed
+    from plr.sidecar.core.base.values import RequestId
+    from plr.sidecar.core.rules.service_rule import ServiceRule
+    from plr.sidecar.core.seam.application import RequestFailed
 
 MAX_WANTED = 64
 """Most requests that wait for one fallback; a longer queue helps nobody."""

@@ -14,9 +14,9 @@ from itertools import islice
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from sidecar.core.base.values import RequestId
-    from sidecar.core.rules.service_rule import FallbackRule
-    from sidecar.core.seam.application import RequestFailed
+    from plr.sidecar.core.base.values import RequestId
+    from plr.sidecar.core.rules.service_rule import FallbackRule
+    from plr.sidecar.core.seam.application import RequestFailed
 
 WINDOW = 128
 """Answers remembered, however old: the robot's processor will be the same tomorrow."""

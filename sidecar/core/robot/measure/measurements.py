@@ -7,9 +7,9 @@ from dataclasses import dataclass
 from operator import itemgetter
 from typing import TYPE_CHECKING
 
-from protos.base.histogram import Histogram
-from protos.base.size_class import size_class
-from protos.model.report import (
+from plr.protos.base.histogram import Histogram
+from plr.protos.base.size_class import size_class
+from plr.protos.model.report import (
     MAX_JOINTS,
     MAX_LATENCIES,
     MAX_PATHS,
@@ -20,16 +20,16 @@ from protos.model.report import (
     PathReport,
     Report,
 )
-from sidecar.core.base.report_scope import ReportScope
-from sidecar.core.base.values import PathState
+from plr.sidecar.core.base.report_scope import ReportScope
+from plr.sidecar.core.base.values import PathState
 
 if TYPE_CHECKING:
-    from protos.model.ids import InterfaceName, NodeName, ServiceName
-    from protos.model.mapping import Assignment
-    from sidecar.core.base.values import PathId
-    from sidecar.core.robot.request.request import Carried
-    from sidecar.core.seam.links import PathMeasured
-    from sidecar.core.transfer.routes import Routes
+    from plr.protos.model.ids import InterfaceName, NodeName, ServiceName
+    from plr.protos.model.mapping import Assignment
+    from plr.sidecar.core.base.values import PathId
+    from plr.sidecar.core.robot.request.request import Carried
+    from plr.sidecar.core.seam.links import PathMeasured
+    from plr.sidecar.core.transfer.routes import Routes
 
 MAX_ANSWER_SIZES = 1024
 """Services whose latest answer size is kept: as many as a robot can carry."""

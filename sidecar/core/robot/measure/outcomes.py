@@ -18,17 +18,17 @@ from __future__ import annotations
 from itertools import combinations
 from typing import TYPE_CHECKING
 
-from protos.model.mapping import Assignment
-from protos.model.redundancy_mode import RedundancyMode
-from sidecar.core.robot.measure.measurements import InterfacePair, PairOutcome
-from sidecar.core.robot.request.request import CopyState
+from plr.protos.model.mapping import Assignment
+from plr.protos.model.redundancy_mode import RedundancyMode
+from plr.sidecar.core.robot.measure.measurements import InterfacePair, PairOutcome
+from plr.sidecar.core.robot.request.request import CopyState
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from protos.model.ids import InterfaceName, NodeName
-    from sidecar.core.robot.measure.measurements import Measurements
-    from sidecar.core.robot.request.request import Copy, Request
+    from plr.protos.model.ids import InterfaceName, NodeName
+    from plr.sidecar.core.robot.measure.measurements import Measurements
+    from plr.sidecar.core.robot.request.request import Copy, Request
 
 
 def interface_outcomes(request: Request) -> Iterator[tuple[InterfacePair, PairOutcome]]:

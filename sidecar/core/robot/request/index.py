@@ -5,9 +5,9 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, TypeVar
 
 if TYPE_CHECKING:
-    from protos.model.ids import NodeName, ServiceName
-    from sidecar.core.base.values import PathId, RequestId
-    from sidecar.core.robot.request.request import Copy, Request
+    from plr.protos.model.ids import NodeName, ServiceName
+    from plr.sidecar.core.base.values import PathId, RequestId
+    from plr.sidecar.core.robot.request.request import Copy, Request
 
 _Key = TypeVar("_Key")
 _Entry = TypeVar("_Entry")

@@ -9,16 +9,16 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from protos.model.ids import Version
-from sidecar.core.base.values import PathState
+from plr.protos.model.ids import Version
+from plr.sidecar.core.base.values import PathState
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Mapping
 
-    from protos.model.ids import InterfaceName, NodeName, ServiceName
-    from protos.model.mapping import MappingSet, ServiceMapping
-    from sidecar.core.base.values import PathId
-    from sidecar.core.transfer.routes import Route, Routes
+    from plr.protos.model.ids import InterfaceName, NodeName, ServiceName
+    from plr.protos.model.mapping import MappingSet, ServiceMapping
+    from plr.sidecar.core.base.values import PathId
+    from plr.sidecar.core.transfer.routes import Route, Routes
 
 
 class MappingTable:

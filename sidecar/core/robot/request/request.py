@@ -6,13 +6,13 @@ import enum
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, NamedTuple
 
-from sidecar.core.base.request_id import is_race
+from plr.sidecar.core.base.request_id import is_race
 
 if TYPE_CHECKING:
-    from protos.model.ids import InterfaceName, NodeName, ServiceName
-    from sidecar.core.base.values import PathId, RequestId
-    from sidecar.core.message.outbound import OutboundMessage
-    from sidecar.core.rules.service_rule import ServiceRule
+    from plr.protos.model.ids import InterfaceName, NodeName, ServiceName
+    from plr.sidecar.core.base.values import PathId, RequestId
+    from plr.sidecar.core.message.outbound import OutboundMessage
+    from plr.sidecar.core.rules.service_rule import ServiceRule
 
 HEDGE_AT = 0.5
 """Share of the deadline after which another server is worth asking if the only one with the request is silent."""
@@ -97,7 +97,7 @@ class Request:
     payload: bytes | None
     submitted_at: float
     size_class: int = 0
-    """Size class, fixed when it was submitted (`protos.base.size_class`)."""
+    """Size class, fixed when it was submitted (`plr.protos.base.size_class`)."""
     size: int = 0
     """Bytes of a copy's message, fixed when it was submitted."""
     held: int = field(init=False)

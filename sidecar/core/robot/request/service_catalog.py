@@ -11,18 +11,18 @@ from __future__ import annotations
 from collections import OrderedDict
 from typing import TYPE_CHECKING
 
-from protos.model.members import ServiceUse
-from sidecar.core.base.fair_share import Shares
-from sidecar.core.seam.application import OfferService, WithdrawService
+from plr.protos.model.members import ServiceUse
+from plr.sidecar.core.base.fair_share import Shares
+from plr.sidecar.core.seam.application import OfferService, WithdrawService
 
 if TYPE_CHECKING:
     from collections.abc import Container, Mapping
 
-    from protos.model.ids import NodeName, ServiceName
-    from protos.model.members import Peer
-    from sidecar.core.rules.service_rule import Rules
-    from sidecar.core.seam.stats import EngineStats
-    from sidecar.core.transfer.routes import Routes
+    from plr.protos.model.ids import NodeName, ServiceName
+    from plr.protos.model.members import Peer
+    from plr.sidecar.core.rules.service_rule import Rules
+    from plr.sidecar.core.seam.stats import EngineStats
+    from plr.sidecar.core.transfer.routes import Routes
 
 MAX_TYPES = 2048
 """Services whose type is remembered; beyond that the one noted longest ago goes. Peers invent names under a glob."""

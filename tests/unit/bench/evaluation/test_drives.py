@@ -11,8 +11,8 @@ import pytest
 from bench.evaluation import ideal, oracle
 from bench.evaluation.drives import find, shared_steps, together
 from bench.evaluation.scenario import read_scenarios
-from controlplane.planning.traces import COLUMNS
 from lab.trace_folder import read_folder
+from plr.controlplane.planning.traces import COLUMNS
 
 if TYPE_CHECKING:
     from collections.abc import Callable

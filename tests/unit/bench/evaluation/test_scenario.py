@@ -15,7 +15,7 @@ from bench.evaluation.scenario import read_scenarios
 from bench.evaluation.windows import choose, cut
 from lab import LinkProfile, Trace, TraceStep
 from lab.trace_folder import TraceEntry
-from protos.base.errors import ConfigError
+from plr.protos.base.errors import ConfigError
 
 if TYPE_CHECKING:
     from pathlib import Path

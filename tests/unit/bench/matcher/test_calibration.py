@@ -12,7 +12,7 @@ from bench.matcher.crossed import cross
 from bench.matcher.feed import LIFETIME_S, Reporter
 from bench.matcher.online import follow
 from bench.matcher.races import Probe, Race, Workload, replay
-from protos.convert import report_from_proto, report_to_proto
+from plr.protos.convert import report_from_proto, report_to_proto
 
 
 class Full(random.Random):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from bench.matcher.fleets import flow_optimum, random_fleet
-from controlplane.solver.matcher import solve
+from plr.controlplane.solver.matcher import solve
 from tests.unit.controlplane.problems import best_price
 
 

@@ -4,8 +4,8 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from controlplane.ca import key_file
-from controlplane.ca.passphrase import NEW_VARIABLE, VARIABLE
+from plr.controlplane.ca import key_file
+from plr.controlplane.ca.passphrase import NEW_VARIABLE, VARIABLE
 from tests.unit.controlplane.ca.shell import Shell
 
 if TYPE_CHECKING:

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from controlplane.cli import __main__
+from plr.controlplane.cli import __main__
 
 
 class Shell:
@@ -50,7 +50,7 @@ class Shell:
 def at_a_terminal(folder: Path, typed: str, *arguments: str) -> tuple[int, str, str]:
     """Run `plr ca` with a terminal at which somebody types; returns its exit code, what it says, and the echo."""
     ours, theirs = pty.openpty()
-    command = [sys.executable, "-m", "controlplane.cli", "ca", *arguments]
+    command = [sys.executable, "-m", "plr.controlplane.cli", "ca", *arguments]
     environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[4])}
     # A session of its own has no other terminal than this.
     with subprocess.Popen(

@@ -5,11 +5,11 @@ from __future__ import annotations
 import pytest
 from cryptography.x509 import ReasonFlags
 
-from controlplane.ca import Authority, AuthorityError
-from controlplane.ca.authority import BACKDATE_S
-from controlplane.ca.request import build_request, parse_request
-from protos.base.errors import DecodeError
-from protos.trust.identity import CertificateError, IdentityRole, Trust
+from plr.controlplane.ca import Authority, AuthorityError
+from plr.controlplane.ca.authority import BACKDATE_S
+from plr.controlplane.ca.request import build_request, parse_request
+from plr.protos.base.errors import DecodeError
+from plr.protos.trust.identity import CertificateError, IdentityRole, Trust
 
 DAY_S = 86_400.0
 

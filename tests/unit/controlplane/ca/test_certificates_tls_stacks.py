@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from controlplane.ca import Authority, Issued, Validity
-from controlplane.ca.files import write_tls_files
-from protos.trust.identity import CONTROL_PLANE_DNS, IdentityRole
+from plr.controlplane.ca import Authority, Issued, Validity
+from plr.controlplane.ca.files import write_tls_files
+from plr.protos.trust.identity import CONTROL_PLANE_DNS, IdentityRole
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from controlplane.ca.passphrase import NEW_VARIABLE, VARIABLE
-from controlplane.cli import __main__
-from protos.program.tls_files import load_tls_files
-from protos.trust.identity import CertificateError, IdentityRole
+from plr.controlplane.ca.passphrase import NEW_VARIABLE, VARIABLE
+from plr.controlplane.cli import __main__
+from plr.protos.program.tls_files import load_tls_files
+from plr.protos.trust.identity import CertificateError, IdentityRole
 
 if TYPE_CHECKING:
     from tests.unit.controlplane.ca.shell import Shell

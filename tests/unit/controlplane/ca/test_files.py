@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from controlplane.ca import Authority
-from controlplane.ca.files import write_atomically, write_tls_files
-from protos.trust.identity import IdentityRole
+from plr.controlplane.ca import Authority
+from plr.controlplane.ca.files import write_atomically, write_tls_files
+from plr.protos.trust.identity import IdentityRole
 
 if TYPE_CHECKING:
     from pathlib import Path

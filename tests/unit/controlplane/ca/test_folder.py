@@ -10,12 +10,12 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from controlplane.ca import Authority, AuthorityError, folder
-from controlplane.ca.actions import refuse_taken
-from controlplane.ca.files import write_atomically
-from controlplane.ca.folder import AuthorityFolder, Protection
-from protos.base.errors import ConfigError
-from protos.trust.identity import CertificateError, IdentityRole, Trust
+from plr.controlplane.ca import Authority, AuthorityError, folder
+from plr.controlplane.ca.actions import refuse_taken
+from plr.controlplane.ca.files import write_atomically
+from plr.controlplane.ca.folder import AuthorityFolder, Protection
+from plr.protos.base.errors import ConfigError
+from plr.protos.trust.identity import CertificateError, IdentityRole, Trust
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -10,14 +10,14 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from controlplane.ca import Authority, AuthorityError, folder
-from controlplane.ca.actions import refuse_taken
-from controlplane.ca.files import write_atomically
-from controlplane.ca.folder import AuthorityFolder
-from controlplane.ca.index import Entry
-from controlplane.cli import __main__
-from protos.base.errors import ConfigError
-from protos.trust.identity import MAX_CA_CERTIFICATES, CertificateError, IdentityRole, Trust
+from plr.controlplane.ca import Authority, AuthorityError, folder
+from plr.controlplane.ca.actions import refuse_taken
+from plr.controlplane.ca.files import write_atomically
+from plr.controlplane.ca.folder import AuthorityFolder
+from plr.controlplane.ca.index import Entry
+from plr.controlplane.cli import __main__
+from plr.protos.base.errors import ConfigError
+from plr.protos.trust.identity import MAX_CA_CERTIFICATES, CertificateError, IdentityRole, Trust
 from tests.unit.controlplane.ca.test_authority import DAY_S, Clock
 
 if TYPE_CHECKING:

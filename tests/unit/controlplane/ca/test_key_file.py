@@ -14,9 +14,9 @@ from cryptography.hazmat.primitives.serialization import (
     load_pem_private_key,
 )
 
-from controlplane.ca import key_file
-from controlplane.ca.certificates import generate_key
-from controlplane.ca.key_file import clear_pem, encrypted_pem, is_encrypted, is_well_encrypted
+from plr.controlplane.ca import key_file
+from plr.controlplane.ca.certificates import generate_key
+from plr.controlplane.ca.key_file import clear_pem, encrypted_pem, is_encrypted, is_well_encrypted
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 import pytest
 from cryptography.hazmat.primitives.serialization import BestAvailableEncryption, Encoding, PrivateFormat
 
-from controlplane.ca.folder import AuthorityFolder, Protection
-from protos.program.tls_files import load_private_key
+from plr.controlplane.ca.folder import AuthorityFolder, Protection
+from plr.protos.program.tls_files import load_private_key
 from tests.unit.controlplane.ca.shell import at_a_terminal
 
 if TYPE_CHECKING:

@@ -13,11 +13,11 @@ from cryptography.hazmat.primitives.asymmetric import ec, ed25519, rsa
 from cryptography.hazmat.primitives.serialization import Encoding
 from cryptography.x509.oid import AttributeOID, ExtendedKeyUsageOID, NameOID
 
-from controlplane.ca.certificates import alternative_names, generate_key
-from controlplane.ca.key_file import clear_pem
-from controlplane.ca.request import MAX_REQUEST_BYTES, build_request, fingerprint, parse_request
-from protos.base.errors import DecodeError
-from protos.trust.identity import CONTROL_PLANE_DNS, IdentityRole
+from plr.controlplane.ca.certificates import alternative_names, generate_key
+from plr.controlplane.ca.key_file import clear_pem
+from plr.controlplane.ca.request import MAX_REQUEST_BYTES, build_request, fingerprint, parse_request
+from plr.protos.base.errors import DecodeError
+from plr.protos.trust.identity import CONTROL_PLANE_DNS, IdentityRole
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -8,12 +8,12 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from controlplane.ca.certificates import generate_key
-from controlplane.ca.folder import AuthorityFolder
-from controlplane.ca.key_file import clear_pem
-from controlplane.ca.request import MAX_REQUEST_BYTES, build_request
-from protos.program.tls_files import load_tls_files
-from protos.trust.identity import IdentityRole
+from plr.controlplane.ca.certificates import generate_key
+from plr.controlplane.ca.folder import AuthorityFolder
+from plr.controlplane.ca.key_file import clear_pem
+from plr.controlplane.ca.request import MAX_REQUEST_BYTES, build_request
+from plr.protos.program.tls_files import load_tls_files
+from plr.protos.trust.identity import IdentityRole
 from tests.unit.controlplane.ca.shell import at_a_terminal
 
 if TYPE_CHECKING:

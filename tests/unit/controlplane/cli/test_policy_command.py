@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from controlplane.cli import __main__
+from plr.controlplane.cli import __main__
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -7,13 +7,13 @@ from dataclasses import replace
 
 import pytest
 
-from controlplane.cli import status_table
-from controlplane.cli.status_table import MAX_HINTED, MAX_LINE, MAX_LINES, render
-from protos.model.ids import InterfaceName, NodeName, Role, ServiceName, SessionId, Version
-from protos.model.mapping import Assignment, ServiceMapping
-from protos.model.members import HeldList, Peer, RevocationSet, ServiceOffer
-from protos.model.report import PathReport
-from protos.model.status import ResourceStatus, SidecarStatus, SyncState
+from plr.controlplane.cli import status_table
+from plr.controlplane.cli.status_table import MAX_HINTED, MAX_LINE, MAX_LINES, render
+from plr.protos.model.ids import InterfaceName, NodeName, Role, ServiceName, SessionId, Version
+from plr.protos.model.mapping import Assignment, ServiceMapping
+from plr.protos.model.members import HeldList, Peer, RevocationSet, ServiceOffer
+from plr.protos.model.report import PathReport
+from plr.protos.model.status import ResourceStatus, SidecarStatus, SyncState
 from tests.support.samples import PLAN, histogram, offer, use
 
 SYNCED = ResourceStatus(Version(7), Version(7), SyncState.SYNCED)

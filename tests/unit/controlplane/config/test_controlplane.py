@@ -10,12 +10,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
-from controlplane.config.controlplane import ControlPlaneConfig, load_config, parse_config
-from controlplane.core.policy.path_rules import PathRule
-from controlplane.core.policy.policy import CallRule, OfferRule, Policy
-from protos.base.errors import ConfigError
-from protos.base.host_port import check_remote, split_host_port
-from protos.program.config_file import MAX_CONFIG_BYTES
+from plr.controlplane.config.controlplane import ControlPlaneConfig, load_config, parse_config
+from plr.controlplane.core.policy.path_rules import PathRule
+from plr.controlplane.core.policy.policy import CallRule, OfferRule, Policy
+from plr.protos.base.errors import ConfigError
+from plr.protos.base.host_port import check_remote, split_host_port
+from plr.protos.program.config_file import MAX_CONFIG_BYTES
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -6,8 +6,8 @@ import logging
 
 import pytest
 
-from controlplane.config.policy_reload import announce
-from controlplane.core.policy.policy import CallRule, OfferRule, Policy
+from plr.controlplane.config.policy_reload import announce
+from plr.controlplane.core.policy.policy import CallRule, OfferRule, Policy
 
 CALLS = (CallRule(("*",), ("/*",), ("*",)),)
 OFFERS = (OfferRule(("*",), ("/*",)),)
@@ -27,7 +27,7 @@ OFFERS = (OfferRule(("*",), ("/*",)),)
 def test_the_policy_in_force_is_announced(
     caplog: pytest.LogCaptureFixture, policy: Policy | None, level: int, said: str
 ) -> None:
-    with caplog.at_level(logging.INFO, "controlplane.config.policy_reload"):
+    with caplog.at_level(logging.INFO, "plr.controlplane.config.policy_reload"):
         announce(policy)
     (record,) = caplog.records
     assert record.levelno == level

@@ -11,14 +11,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from controlplane.observe import event_log
-from controlplane.observe.event_lines import decode, encode
-from controlplane.observe.event_log import FILE, EventLog
-from controlplane.observe.remembered import departures
-from protos.base.errors import DecodeError
-from protos.model.fleet_events import EventKind, EventQuery, FleetEvent, Why
-from protos.model.ids import NodeName, Role
-from protos.program import own_folder
+from plr.controlplane.observe import event_log
+from plr.controlplane.observe.event_lines import decode, encode
+from plr.controlplane.observe.event_log import FILE, EventLog
+from plr.controlplane.observe.remembered import departures
+from plr.protos.base.errors import DecodeError
+from plr.protos.model.fleet_events import EventKind, EventQuery, FleetEvent, Why
+from plr.protos.model.ids import NodeName, Role
+from plr.protos.program import own_folder
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -140,7 +140,7 @@ def test_a_wrong_number_costs_one_event(tmp_path: Path, wrong: int, place: int) 
 
 def test_the_file_is_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(event_log, "MAX_FILE_BYTES", 20_000)
-    monkeypatch.setattr("controlplane.core.explain.event_memory.MAX_EVENTS", 50)
+    monkeypatch.setattr("plr.controlplane.core.explain.event_memory.MAX_EVENTS", 50)
     log = EventLog(tmp_path)
     for number in range(2000):
         log.record(EventKind.CONNECTED, NodeName(f"robot-{number}"), "x" * 100, role=Role.ROBOT)

@@ -10,20 +10,20 @@ from dataclasses import replace
 
 import pytest
 
-from controlplane import turns
-from controlplane.cli.status_table import render
-from controlplane.config.controlplane import ControlPlaneConfig
-from controlplane.core.control.events import Settings
-from controlplane.core.estimate.fading import FadedHistogram
-from controlplane.core.estimate.network import PathView
-from controlplane.core.estimate.unanswered import LATELY_S
-from controlplane.core.explain.departed import Departure
-from controlplane.core.explain.fleet_view import MAX_VIEWED, InterfaceView, MemberView, MissView, ServedView
-from controlplane.core.policy.policy import CallRule, OfferRule, Policy
-from controlplane.core.registry.registry import Refusal
-from controlplane.loop import ControlLoop
-from controlplane.observe.event_log import EventLog
-from controlplane.observe.fleet_metrics import (
+from plr.controlplane import turns
+from plr.controlplane.cli.status_table import render
+from plr.controlplane.config.controlplane import ControlPlaneConfig
+from plr.controlplane.core.control.events import Settings
+from plr.controlplane.core.estimate.fading import FadedHistogram
+from plr.controlplane.core.estimate.network import PathView
+from plr.controlplane.core.estimate.unanswered import LATELY_S
+from plr.controlplane.core.explain.departed import Departure
+from plr.controlplane.core.explain.fleet_view import MAX_VIEWED, InterfaceView, MemberView, MissView, ServedView
+from plr.controlplane.core.policy.policy import CallRule, OfferRule, Policy
+from plr.controlplane.core.registry.registry import Refusal
+from plr.controlplane.loop import ControlLoop
+from plr.controlplane.observe.event_log import EventLog
+from plr.controlplane.observe.fleet_metrics import (
     MAX_GONE,
     MAX_SERIES,
     MAX_SERIES_OF_SERVICES,
@@ -32,15 +32,15 @@ from controlplane.observe.fleet_metrics import (
     FleetCollector,
     families,
 )
-from controlplane.observe.metrics import Metrics
-from protos.base.histogram import Histogram
-from protos.model.fleet_events import DepartedSidecar, Why
-from protos.model.ids import InterfaceName, NodeName, Role, ServiceName
-from protos.model.mapping import Assignment, ServiceMapping
-from protos.model.members import CandidateSet, InterfaceLabel, RemovalReason, ServiceSet
-from protos.model.redundancy_mode import RedundancyMode
-from protos.model.report import OutcomeReport, PathReport, Report
-from protos.model.stream import Drain
+from plr.controlplane.observe.metrics import Metrics
+from plr.protos.base.histogram import Histogram
+from plr.protos.model.fleet_events import DepartedSidecar, Why
+from plr.protos.model.ids import InterfaceName, NodeName, Role, ServiceName
+from plr.protos.model.mapping import Assignment, ServiceMapping
+from plr.protos.model.members import CandidateSet, InterfaceLabel, RemovalReason, ServiceSet
+from plr.protos.model.redundancy_mode import RedundancyMode
+from plr.protos.model.report import OutcomeReport, PathReport, Report
+from plr.protos.model.stream import Drain
 from tests.support.control_world import SETTLED_S, SimSidecar, World
 from tests.support.samples import PLAN, histogram, interfaces, latency, offer, path, registration, use
 from tests.support.scrapes import fleet_of, series, value

@@ -6,9 +6,9 @@ import time
 
 import prometheus_client
 
-from controlplane.observe.fleet_metrics import REUSED_S, Fleet
-from controlplane.observe.metrics import Metrics
-from protos.model.report import OutcomeReport, Report
+from plr.controlplane.observe.fleet_metrics import REUSED_S, Fleet
+from plr.controlplane.observe.metrics import Metrics
+from plr.protos.model.report import OutcomeReport, Report
 from tests.support.control_world import World
 from tests.support.samples import PLAN
 

@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from controlplane.planning.fifo import FifoLink, FifoPath
 from lab.errors import LabConfigError
 from lab.profile import LinkProfile
 from lab.trace_folder import read_folder
 from lab.traces import TraceStep
+from plr.controlplane.planning.fifo import FifoLink, FifoPath
 
 if TYPE_CHECKING:
     from pathlib import Path

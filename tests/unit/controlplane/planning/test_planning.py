@@ -12,18 +12,18 @@ import numpy as np
 import pytest
 from google.protobuf import json_format
 
-from controlplane.cli.__main__ import main
-from controlplane.planning.prospects import Prospect, least_set, paths_needed
-from controlplane.planning.recorded import RecordedService
-from controlplane.planning.replay import ReplayedTraces, replay
-from controlplane.planning.traces import COLUMNS, RecordedPaths, parse_trace
-from controlplane.planning.workload import Compute, Workload
-from protos.base.histogram import Histogram
-from protos.convert import explanation_to_proto
-from protos.model.explanation import SAMPLE, Belief, Correlation, Explanation, JointExplanation, PairExplanation
-from protos.model.ids import InterfaceName, NodeName, ServiceName
-from protos.model.mapping import Assignment
-from protos.model.status import ResourceStatus
+from plr.controlplane.cli.__main__ import main
+from plr.controlplane.planning.prospects import Prospect, least_set, paths_needed
+from plr.controlplane.planning.recorded import RecordedService
+from plr.controlplane.planning.replay import ReplayedTraces, replay
+from plr.controlplane.planning.traces import COLUMNS, RecordedPaths, parse_trace
+from plr.controlplane.planning.workload import Compute, Workload
+from plr.protos.base.histogram import Histogram
+from plr.protos.convert import explanation_to_proto
+from plr.protos.model.explanation import SAMPLE, Belief, Correlation, Explanation, JointExplanation, PairExplanation
+from plr.protos.model.ids import InterfaceName, NodeName, ServiceName
+from plr.protos.model.mapping import Assignment
+from plr.protos.model.status import ResourceStatus
 from tests.support.samples import histogram
 
 if TYPE_CHECKING:

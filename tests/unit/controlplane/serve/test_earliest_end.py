@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from controlplane.serve.earliest_end import EarliestEnd
-from protos.model.ids import NodeName
+from plr.controlplane.serve.earliest_end import EarliestEnd
+from plr.protos.model.ids import NodeName
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from controlplane.ca import Authority
-from controlplane.serve.gate_pipe import PipeEnd
-from protos.model.ids import NodeName
-from protos.trust.identity import IdentityRole
+from plr.controlplane.ca import Authority
+from plr.controlplane.serve.gate_pipe import PipeEnd
+from plr.protos.model.ids import NodeName
+from plr.protos.trust.identity import IdentityRole
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import asyncio
 
-from controlplane.core.publish.messages import CloseReason
-from controlplane.serve.mailbox import Mailbox
-from protos.model.ids import NodeName, Role, SessionId, Version
-from protos.model.mapping import MappingSet
-from protos.model.members import Peer, PeerSet, RemovalReason, RemovedPeer
-from protos.model.stream import Welcome
+from plr.controlplane.core.publish.messages import CloseReason
+from plr.controlplane.serve.mailbox import Mailbox
+from plr.protos.model.ids import NodeName, Role, SessionId, Version
+from plr.protos.model.mapping import MappingSet
+from plr.protos.model.members import Peer, PeerSet, RemovalReason, RemovedPeer
+from plr.protos.model.stream import Welcome
 
 WELCOME = Welcome(5.0, 0.5)
 

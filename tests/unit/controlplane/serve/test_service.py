@@ -8,22 +8,22 @@ from typing import TYPE_CHECKING, Any, cast
 import grpc
 import pytest
 
-from controlplane.core.overload.report_share import ReportShares
-from controlplane.serve import service as module
-from controlplane.serve.mailbox import Mailbox
-from controlplane.serve.service import ControlPlaneService
-from controlplane.serve.stream_limits import MAX_FIRST_BYTES
-from protos.convert import sidecar_message_to_proto
-from protos.model.ids import Version
-from protos.model.members import PeerSet
-from protos.model.report import Report
-from protos.model.stream import Heartbeat
-from protos.plr.v1 import control_pb2
+from plr.controlplane.core.overload.report_share import ReportShares
+from plr.controlplane.serve import service as module
+from plr.controlplane.serve.mailbox import Mailbox
+from plr.controlplane.serve.service import ControlPlaneService
+from plr.controlplane.serve.stream_limits import MAX_FIRST_BYTES
+from plr.protos.convert import sidecar_message_to_proto
+from plr.protos.model.ids import Version
+from plr.protos.model.members import PeerSet
+from plr.protos.model.report import Report
+from plr.protos.model.stream import Heartbeat
+from plr.protos.plr.v1 import control_pb2
 from tests.support.samples import registration
 
 if TYPE_CHECKING:
-    from controlplane.loop import ControlLoop
-    from controlplane.serve.service import Context
+    from plr.controlplane.loop import ControlLoop
+    from plr.controlplane.serve.service import Context
 
 
 class Loop:

@@ -6,12 +6,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from controlplane.core.publish.told_peers import ToldPeers
-from controlplane.serve import stream_encoder
-from controlplane.serve.stream_encoder import StreamEncoder
-from protos.convert import parse_control_message
-from protos.model.ids import NodeName, Role, ServiceName, SessionId, Version
-from protos.model.members import Peer, PeerSet, RemovalReason, RemovedPeer, ServiceOffer
+from plr.controlplane.core.publish.told_peers import ToldPeers
+from plr.controlplane.serve import stream_encoder
+from plr.controlplane.serve.stream_encoder import StreamEncoder
+from plr.protos.convert import parse_control_message
+from plr.protos.model.ids import NodeName, Role, ServiceName, SessionId, Version
+from plr.protos.model.members import Peer, PeerSet, RemovalReason, RemovedPeer, ServiceOffer
 from tests.unit.protos.message_strategies import control_messages, peers
 
 ENCODER = StreamEncoder()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from controlplane.serve.stream_limits import (
+from plr.controlplane.serve.stream_limits import (
     MAX_MESSAGE_BYTES,
     MAX_STREAMS_PER_NAME,
     MESSAGES_BURST,
@@ -12,9 +12,9 @@ from controlplane.serve.stream_limits import (
     StreamCount,
     StreamRate,
 )
-from protos.convert.reports import report_entries
-from protos.model.ids import NodeName
-from protos.model.report import OutcomeReport, PenaltyReport, Report
+from plr.protos.convert.reports import report_entries
+from plr.protos.model.ids import NodeName
+from plr.protos.model.report import OutcomeReport, PenaltyReport, Report
 from tests.support.samples import PLAN
 
 

@@ -9,12 +9,12 @@ import pytest
 
 _STARTS_AND_SOLVES = """
 import sys
-import controlplane.__main__, controlplane.serve.server
-from controlplane.solver.matcher import Matcher
-from controlplane.core.problem.problem import Problem
+import plr.controlplane.__main__, plr.controlplane.serve.server
+from plr.controlplane.solver.matcher import Matcher
+from plr.controlplane.core.problem.problem import Problem
 Matcher().solve(Problem(()), time_limit_s=1.0)
 assert "ortools" not in sys.modules and "pandas" not in sys.modules
-from controlplane.solver import cp_sat
+from plr.controlplane.solver import cp_sat
 cp_sat.prepare()
 assert "ortools" in sys.modules
 """

@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 from scipy.optimize import linear_sum_assignment
 
-from controlplane.core.problem.plan import price
-from controlplane.core.problem.problem import Block, FleetKey, Objective, Problem, Target, is_valid
-from controlplane.solver.cp_sat import RESOLUTION
-from controlplane.solver.matcher import Matcher, solve
-from protos.model.ids import NodeName
-from protos.model.members import AT_MOST_EVERY_INTERFACE, Copies
+from plr.controlplane.core.problem.plan import price
+from plr.controlplane.core.problem.problem import Block, FleetKey, Objective, Problem, Target, is_valid
+from plr.controlplane.solver.cp_sat import RESOLUTION
+from plr.controlplane.solver.matcher import Matcher, solve
+from plr.protos.model.ids import NodeName
+from plr.protos.model.members import AT_MOST_EVERY_INTERFACE, Copies
 from tests.unit.controlplane.problems import PLAN, best_price, block, choices_of, fleet, random_problem
 
 AMPLE_S = 60.0

@@ -11,22 +11,22 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from controlplane.core.estimate.fading import FORGET_S
-from controlplane.core.estimate.processing import ComputeTimes
-from controlplane.core.problem.problem import Block, BlockKey, FleetKey, Objective, Problem
-from controlplane.core.publish.snapshots import VersionSource
-from controlplane.solver import group
-from controlplane.solver.matcher import Matcher
-from protos.convert import use_from_proto, use_to_proto
-from protos.model.ids import MAX_VERSION, InterfaceName, NodeName, ServiceName, Version
-from protos.model.members import Copies
+from plr.controlplane.core.estimate.fading import FORGET_S
+from plr.controlplane.core.estimate.processing import ComputeTimes
+from plr.controlplane.core.problem.problem import Block, BlockKey, FleetKey, Objective, Problem
+from plr.controlplane.core.publish.snapshots import VersionSource
+from plr.controlplane.solver import group
+from plr.controlplane.solver.matcher import Matcher
+from plr.protos.convert import use_from_proto, use_to_proto
+from plr.protos.model.ids import MAX_VERSION, InterfaceName, NodeName, ServiceName, Version
+from plr.protos.model.members import Copies
 from tests.support.samples import histogram, use
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from controlplane.core.problem.plan import Plan
-    from controlplane.core.problem.problem import FleetKey as Key
+    from plr.controlplane.core.problem.plan import Plan
+    from plr.controlplane.core.problem.problem import FleetKey as Key
 
 SERVICE = ServiceName("/plan")
 

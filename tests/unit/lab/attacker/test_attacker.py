@@ -10,7 +10,7 @@ import pytest
 from lab.attacker.junk import JunkKind, flipped, headed, make_junk, mangled
 from lab.attacker.send_many import BATCH, Volley, flood
 from lab.attacker.wire import Captured, parse
-from sidecar.core.wire.frame import HEADER_BYTES, MAX_DATAGRAM_BYTES
+from plr.sidecar.core.wire.frame import HEADER_BYTES, MAX_DATAGRAM_BYTES
 
 REAL = [bytes(range(100)), bytes(range(200))]
 

@@ -9,9 +9,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from protos.base.errors import DecodeError
-from protos.base.histogram import BUCKETS, EDGES, GROWTH, LAYOUT, MAX_COUNT, MAX_S, MIDS, MIN_S, Histogram
-from protos.convert.types import histogram_to_proto
+from plr.protos.base.errors import DecodeError
+from plr.protos.base.histogram import BUCKETS, EDGES, GROWTH, LAYOUT, MAX_COUNT, MAX_S, MIDS, MIN_S, Histogram
+from plr.protos.convert.types import histogram_to_proto
 
 latencies = st.floats(min_value=MIN_S, max_value=MAX_S, exclude_max=True, allow_nan=False)
 any_latency = st.floats(min_value=0.0, max_value=1e9, allow_nan=False) | st.just(math.inf)

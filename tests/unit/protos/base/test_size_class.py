@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import pytest
 
-from protos.base.size_class import SIZE_CLASSES, size_class
+from plr.protos.base.size_class import SIZE_CLASSES, size_class
 
 
 @pytest.mark.parametrize(

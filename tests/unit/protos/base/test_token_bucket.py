@@ -5,7 +5,7 @@ from __future__ import annotations
 from hypothesis import given
 from hypothesis import strategies as st
 
-from protos.base.token_bucket import TokenBucket
+from plr.protos.base.token_bucket import TokenBucket
 
 
 def test_a_burst_goes_through_at_once_and_then_the_rate_decides() -> None:

@@ -10,8 +10,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from protos.base.errors import DecodeError, UnknownKindError
-from protos.convert import (
+from plr.protos.base.errors import DecodeError, UnknownKindError
+from plr.protos.convert import (
     control_message_from_proto,
     control_message_to_proto,
     departed_from_proto,
@@ -30,10 +30,10 @@ from protos.convert import (
     status_from_proto,
     status_to_proto,
 )
-from protos.convert.fields import MAX_CANDIDATES, MAX_OFFERS
-from protos.model.fleet_events import EventList
-from protos.model.ids import MAX_VERSION, InterfaceId, InterfaceName, NodeName, Role, SessionId, Version
-from protos.model.members import (
+from plr.protos.convert.fields import MAX_CANDIDATES, MAX_OFFERS
+from plr.protos.model.fleet_events import EventList
+from plr.protos.model.ids import MAX_VERSION, InterfaceId, InterfaceName, NodeName, Role, SessionId, Version
+from plr.protos.model.members import (
     ALL_CALLS,
     MAX_CREDENTIAL_BYTES,
     NO_CALLS,
@@ -47,16 +47,16 @@ from protos.model.members import (
     RevocationSet,
     ServiceSet,
 )
-from protos.model.names import MAX_STRING_BYTES, clean_text
-from protos.model.redundancy_mode import DEFAULT_HEDGE_QUANTILE, RedundancyMode
-from protos.model.status import SidecarStatus
-from protos.model.stream import Ack, ControlMessage, Nack, ResourceKind, SidecarMessage
-from protos.plr.v1 import admin_pb2, control_pb2, types_pb2
+from plr.protos.model.names import MAX_STRING_BYTES, clean_text
+from plr.protos.model.redundancy_mode import DEFAULT_HEDGE_QUANTILE, RedundancyMode
+from plr.protos.model.status import SidecarStatus
+from plr.protos.model.stream import Ack, ControlMessage, Nack, ResourceKind, SidecarMessage
+from plr.protos.plr.v1 import admin_pb2, control_pb2, types_pb2
 from tests.unit.protos import message_strategies as some
 
 if TYPE_CHECKING:
-    from protos.model.explanation import Explanation
-    from protos.model.fleet_events import DepartedSidecar, EventLogState, FleetEvent
+    from plr.protos.model.explanation import Explanation
+    from plr.protos.model.fleet_events import DepartedSidecar, EventLogState, FleetEvent
 
 PEERS = control_pb2.RESOURCE_KIND_PEERS
 LEFT = control_pb2.REMOVAL_REASON_LEFT

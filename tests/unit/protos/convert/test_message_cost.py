@@ -8,13 +8,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from protos.base.errors import DecodeError, UnknownKindError
-from protos.base.histogram import BUCKETS
-from protos.convert import message_cost, parse_sidecar_message, sidecar_message_to_proto
-from protos.convert.message_cost import CHEAP_BYTES, SPARE_FIELDS, check_cost
-from protos.model.report import MAX_LATENCIES, MAX_PATHS, Report
-from protos.model.stream import Heartbeat, SidecarMessage
-from protos.plr.v1 import control_pb2, types_pb2
+from plr.protos.base.errors import DecodeError, UnknownKindError
+from plr.protos.base.histogram import BUCKETS
+from plr.protos.convert import message_cost, parse_sidecar_message, sidecar_message_to_proto
+from plr.protos.convert.message_cost import CHEAP_BYTES, SPARE_FIELDS, check_cost
+from plr.protos.model.report import MAX_LATENCIES, MAX_PATHS, Report
+from plr.protos.model.stream import Heartbeat, SidecarMessage
+from plr.protos.plr.v1 import control_pb2, types_pb2
 from tests.support.samples import histogram, latency, path
 from tests.unit.protos.message_strategies import sidecar_messages
 
@@ -47,7 +47,7 @@ def test_what_is_bloated_is_never_parsed(kind: str, monkeypatch: pytest.MonkeyPa
         def FromString(_: bytes) -> None:  # protobuf's name
             raise AssertionError("parsed")
 
-    monkeypatch.setattr("protos.convert.control.control_pb2.SidecarMessage", Parser)
+    monkeypatch.setattr("plr.protos.convert.control.control_pb2.SidecarMessage", Parser)
     with pytest.raises(DecodeError, match=f"^{kind} has more than [0-9]+ elements$"):
         parse_sidecar_message(data)
 

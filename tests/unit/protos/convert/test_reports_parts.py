@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import pytest
 
-from controlplane.core.estimate.estimator import Estimator
-from protos.base.errors import DecodeError
-from protos.convert import parse_in_parts, parse_sidecar_message, sidecar_message_to_proto
-from protos.convert.reports import PART_ENTRIES
-from protos.model.ids import InterfaceName, NodeName, ServiceName
-from protos.model.report import MAX_PATHS, PenaltyReport, Report
-from protos.model.stream import Heartbeat
-from protos.plr.v1 import control_pb2
+from plr.controlplane.core.estimate.estimator import Estimator
+from plr.protos.base.errors import DecodeError
+from plr.protos.convert import parse_in_parts, parse_sidecar_message, sidecar_message_to_proto
+from plr.protos.convert.reports import PART_ENTRIES
+from plr.protos.model.ids import InterfaceName, NodeName, ServiceName
+from plr.protos.model.report import MAX_PATHS, PenaltyReport, Report
+from plr.protos.model.stream import Heartbeat
+from plr.protos.plr.v1 import control_pb2
 from tests.support.samples import histogram, latency, path
 
 ROBOT, SERVER, PLAN = NodeName("robot"), NodeName("a"), ServiceName("/plan")

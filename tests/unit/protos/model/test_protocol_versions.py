@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from protos.model.protocol_versions import OURS, Spoken, refusal
+from plr.protos.model.protocol_versions import OURS, Spoken, refusal
 
 pytestmark = pytest.mark.audit("ops-10")
 

@@ -8,15 +8,15 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from controlplane.__main__ import main as control_plane
-from controlplane.ca import Authority
-from controlplane.ca.authority import AuthorityError
-from controlplane.ca.certificates import Validity
-from protos.program import tls_advice
-from protos.program.certificate_term import SOON_S, term_problem
-from protos.program.tls_files import load_tls_files
-from protos.trust.identity import IdentityRole
-from sidecar.__main__ import main as sidecar
+from plr.controlplane.__main__ import main as control_plane
+from plr.controlplane.ca import Authority
+from plr.controlplane.ca.authority import AuthorityError
+from plr.controlplane.ca.certificates import Validity
+from plr.protos.program import tls_advice
+from plr.protos.program.certificate_term import SOON_S, term_problem
+from plr.protos.program.tls_files import load_tls_files
+from plr.protos.trust.identity import IdentityRole
+from plr.sidecar.__main__ import main as sidecar
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from protos.base.errors import ConfigError
-from protos.program.config_file import MAX_VALUES, parse_yaml, read_text
+from plr.protos.base.errors import ConfigError
+from plr.protos.program.config_file import MAX_VALUES, parse_yaml, read_text
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -10,19 +10,19 @@ from pathlib import Path
 
 import pytest
 
-from protos.program.endings import ends_quietly
+from plr.protos.program.endings import ends_quietly
 
 pytestmark = pytest.mark.audit("ops-14")
 
 ROOT = Path(__file__).parents[4]
 PROGRAMS = [
-    ["protos.program.command_line", "config", "schema", "controlplane"],
-    ["sidecar", "--print-schema"],
+    ["plr.protos.program.command_line", "config", "schema", "controlplane"],
+    ["plr.sidecar", "--print-schema"],
 ]
 FULL = Path("/dev/full")
 WAITING = """
 import sys, time
-from protos.program.endings import ended_by_ctrl_c, ends_quietly
+from plr.protos.program.endings import ended_by_ctrl_c, ends_quietly
 @ends_quietly("plr")
 def main():
     {how}: print("ready", flush=True); time.sleep(60)
@@ -75,7 +75,7 @@ def test_ctrl_c_ends_without_a_trace(how: str, code: int) -> None:
 
 
 def test_no_file_of_ours_gets_the_number_of_a_standard_stream() -> None:
-    code = "import os; from protos.program.endings import ends_quietly; "
+    code = "import os; from plr.protos.program.endings import ends_quietly; "
     code += "ends_quietly('plr')(lambda: 0)(); os._exit(os.dup(0))"
     with subprocess.Popen(
         ["sh", "-c", 'exec "$@" <&- >&- 2>&-', "sh", sys.executable, "-c", code], cwd=ROOT

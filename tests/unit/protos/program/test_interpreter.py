@@ -9,7 +9,7 @@ import pytest
 
 PROGRAM = """
 import gc, weakref
-from protos.program import interpreter
+from plr.protos.program import interpreter
 
 class Node:
     pass

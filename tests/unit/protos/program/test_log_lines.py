@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from protos.base.printable import escaped
-from protos.program.log_lines import JournalFormatter, LineFormatter, is_journal, line_formatter
-from sidecar.core.base.values import RejectReason
-from sidecar.core.wire.messages import RejectionMessage, decode_message, encode_message
+from plr.protos.base.printable import escaped
+from plr.protos.program.log_lines import JournalFormatter, LineFormatter, is_journal, line_formatter
+from plr.sidecar.core.base.values import RejectReason
+from plr.sidecar.core.wire.messages import RejectionMessage, decode_message, encode_message
 from tests.support.builders import request_id
 
 if TYPE_CHECKING:
@@ -25,9 +25,9 @@ FORGED = "x\n2026-11-22T18:16:15.605Z INFO runtime: all is well\x1b[2J\x9b1A\u20
 
 def line_of(text: str, *, exc_info: BaseException | None = None) -> str:
     trouble = None if exc_info is None else (type(exc_info), exc_info, None)
-    record = logging.LogRecord("sidecar.net.path_log", logging.WARNING, __file__, 1, "%s", (text,), trouble)
+    record = logging.LogRecord("plr.sidecar.net.path_log", logging.WARNING, __file__, 1, "%s", (text,), trouble)
     record.created, record.msecs = 1767225600.25, 250.0
-    return LineFormatter("sidecar").format(record)
+    return LineFormatter("plr.sidecar").format(record)
 
 
 def test_a_line_is_what_it_was() -> None:
@@ -64,11 +64,11 @@ def test_a_rejections_words_are_printable() -> None:
 
 @pytest.mark.audit("ops-6")
 def test_the_journal_gets_priorities_and_no_second_time() -> None:
-    record = logging.LogRecord("sidecar.net.path_log", logging.WARNING, __file__, 1, "is down", (), None)
-    assert JournalFormatter("sidecar").format(record) == "<4>net.path_log: is down"
+    record = logging.LogRecord("plr.sidecar.net.path_log", logging.WARNING, __file__, 1, "is down", (), None)
+    assert JournalFormatter("plr.sidecar").format(record) == "<4>net.path_log: is down"
     record.levelno = logging.CRITICAL
     record.exc_info = (ValueError, ValueError(FORGED), None)
-    told = JournalFormatter("sidecar").format(record).split("\n")
+    told = JournalFormatter("plr.sidecar").format(record).split("\n")
     assert len(told) > 1
     assert all(line.startswith("<2>") and line.isprintable() for line in told)
 

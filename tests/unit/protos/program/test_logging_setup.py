@@ -8,24 +8,24 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from protos.program import logging_setup
-from protos.program.log_lines import line_formatter
-from protos.program.logging_setup import Logging
+from plr.protos.program import logging_setup
+from plr.protos.program.log_lines import line_formatter
+from plr.protos.program.logging_setup import Logging
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-OURS = logging.getLogger("sidecar.net.sockets")
+OURS = logging.getLogger("plr.sidecar.net.sockets")
 LINE = re.compile(r"\d{4}-\d\d-\d\dT\d\d:\d\d:\d\d\.\d{3}Z [A-Z]+ \S+: .*")
 
 
 def logging_to(stream: io.StringIO, level: str, max_waiting: int = logging_setup.MAX_WAITING_LINES) -> Logging:
-    return Logging("sidecar", level, stream, line_formatter(stream, "sidecar"), max_waiting=max_waiting)
+    return Logging("plr.sidecar", level, stream, line_formatter(stream, "plr.sidecar"), max_waiting=max_waiting)
 
 
 @pytest.fixture(autouse=True)
 def _levels() -> Iterator[None]:
-    loggers = [logging.getLogger(name) for name in (None, "sidecar", "protos")]
+    loggers = [logging.getLogger(name) for name in (None, "plr.sidecar", "plr.protos")]
     levels = [logger.level for logger in loggers]
     yield
     for logger, level in zip(loggers, levels, strict=True):

@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING
 import pytest
 from prometheus_client import CollectorRegistry, Gauge
 
-from protos.program import metrics_server
-from protos.program.metrics_server import MAX_CONNECTIONS, MetricsServer
+from plr.protos.program import metrics_server
+from plr.protos.program.metrics_server import MAX_CONNECTIONS, MetricsServer
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator

@@ -7,11 +7,11 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from controlplane.observe.event_log import EventLog
-from protos.model.fleet_events import EventKind
-from protos.model.ids import NodeName
-from protos.program.own_folder import OwnFolder
-from sidecar.state.store import StateDirError, StateStore
+from plr.controlplane.observe.event_log import EventLog
+from plr.protos.model.fleet_events import EventKind
+from plr.protos.model.ids import NodeName
+from plr.protos.program.own_folder import OwnFolder
+from plr.sidecar.state.store import StateDirError, StateStore
 
 if TYPE_CHECKING:
     from pathlib import Path

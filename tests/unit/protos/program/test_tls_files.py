@@ -10,12 +10,12 @@ import pytest
 from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.hazmat.primitives.serialization import BestAvailableEncryption, Encoding, NoEncryption, PrivateFormat
 
-from controlplane.ca import Authority
-from controlplane.ca.files import write_tls_files
-from protos.base.errors import ConfigError
-from protos.model.ids import NodeName
-from protos.program.tls_files import MAX_FILE_BYTES, RefusedFiles, TlsWatch, load_tls_files
-from protos.trust.identity import CertificateError, IdentityRole
+from plr.controlplane.ca import Authority
+from plr.controlplane.ca.files import write_tls_files
+from plr.protos.base.errors import ConfigError
+from plr.protos.model.ids import NodeName
+from plr.protos.program.tls_files import MAX_FILE_BYTES, RefusedFiles, TlsWatch, load_tls_files
+from plr.protos.trust.identity import CertificateError, IdentityRole
 
 if TYPE_CHECKING:
     from collections.abc import Callable

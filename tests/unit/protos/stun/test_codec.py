@@ -8,8 +8,8 @@ import struct
 
 import pytest
 
-from protos.base.errors import DecodeError
-from protos.stun.codec import (
+from plr.protos.base.errors import DecodeError
+from plr.protos.stun.codec import (
     MAX_MESSAGE_BYTES,
     MAX_UNKNOWN_ATTRIBUTES,
     MessageClass,

@@ -7,12 +7,12 @@ from cryptography.hazmat.primitives.asymmetric import ec
 from hypothesis import given
 from hypothesis import strategies as st
 
-from controlplane.ca import Authority
-from protos.base.errors import DecodeError
-from protos.model.ids import InterfaceId, InterfaceName, SessionId
-from protos.model.members import MAX_SIGNATURE_BYTES, Candidate, CandidateKind
-from protos.trust.candidate_signature import sign_candidates, signed_bytes, verify_candidates
-from protos.trust.identity import CertificateError, IdentityRole
+from plr.controlplane.ca import Authority
+from plr.protos.base.errors import DecodeError
+from plr.protos.model.ids import InterfaceId, InterfaceName, SessionId
+from plr.protos.model.members import MAX_SIGNATURE_BYTES, Candidate, CandidateKind
+from plr.protos.trust.candidate_signature import sign_candidates, signed_bytes, verify_candidates
+from plr.protos.trust.identity import CertificateError, IdentityRole
 from tests.unit.protos import message_strategies as some
 
 pytestmark = pytest.mark.audit("sec-5")

@@ -2,9 +2,9 @@ from __future__ import annotations
 
 import pytest
 
-from controlplane.ca import Authority
-from protos.trust.clock_floor import SLACK_S, ClockFloor
-from protos.trust.identity import EXPIRED, CertificateError, IdentityRole, Trust
+from plr.controlplane.ca import Authority
+from plr.protos.trust.clock_floor import SLACK_S, ClockFloor
+from plr.protos.trust.identity import EXPIRED, CertificateError, IdentityRole, Trust
 
 pytestmark = pytest.mark.audit("sec-9")
 

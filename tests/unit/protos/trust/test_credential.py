@@ -7,11 +7,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from protos.base.errors import DecodeError
-from protos.model.ids import NodeName, Role, SessionId
-from protos.model.members import MAX_CREDENTIAL_BYTES
-from protos.trust.credential import Aead, SessionCredential, decode_credential, session_number, verify
-from protos.trust.identity import CertificateError, Identity, IdentityRole
+from plr.protos.base.errors import DecodeError
+from plr.protos.model.ids import NodeName, Role, SessionId
+from plr.protos.model.members import MAX_CREDENTIAL_BYTES
+from plr.protos.trust.credential import Aead, SessionCredential, decode_credential, session_number, verify
+from plr.protos.trust.identity import CertificateError, Identity, IdentityRole
 from tests.unit.protos import message_strategies as some
 
 credentials = st.builds(

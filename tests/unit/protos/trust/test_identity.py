@@ -9,8 +9,8 @@ from cryptography.hazmat.primitives.asymmetric import ec, ed25519
 from cryptography.hazmat.primitives.serialization import Encoding
 from cryptography.x509.oid import ExtendedKeyUsageOID
 
-from controlplane.ca import Authority, Validity
-from protos.trust.identity import (
+from plr.controlplane.ca import Authority, Validity
+from plr.protos.trust.identity import (
     CONTROL_PLANE_DNS,
     MAX_CA_CERTIFICATES,
     MAX_CERTIFICATE_BYTES,

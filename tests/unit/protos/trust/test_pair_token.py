@@ -6,9 +6,9 @@ import pytest
 from cryptography.hazmat.primitives.hashes import SHA256
 from cryptography.hazmat.primitives.kdf.hkdf import HKDFExpand
 
-from protos.model.ids import NodeName, Role
-from protos.model.members import TOKEN_BYTES
-from protos.trust.pair_token import pair_token
+from plr.protos.model.ids import NodeName, Role
+from plr.protos.model.members import TOKEN_BYTES
+from plr.protos.trust.pair_token import pair_token
 
 TOKEN, ROBOT = bytes(range(16)), NodeName("robot-1")
 

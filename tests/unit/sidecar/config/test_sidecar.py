@@ -8,10 +8,10 @@ import pytest
 import yaml
 from pydantic import ValidationError
 
-from protos.base.errors import ConfigError
-from protos.model.ids import InterfaceName, NodeName, Role
-from protos.trust.identity import Identity, IdentityRole
-from sidecar.config.sidecar import (
+from plr.protos.base.errors import ConfigError
+from plr.protos.model.ids import InterfaceName, NodeName, Role
+from plr.protos.trust.identity import Identity, IdentityRole
+from plr.sidecar.config.sidecar import (
     DEFAULT_CLOUD_UDP_PORT,
     LogLevel,
     SidecarConfig,
@@ -20,7 +20,7 @@ from sidecar.config.sidecar import (
     parse_config,
     refuse_exposed,
 )
-from sidecar.core.control.ways import Price
+from plr.sidecar.core.control.ways import Price
 from tests.unit.sidecar.configs import CLOUD, ROBOT, SOURCE, parse
 
 

@@ -5,8 +5,8 @@ from typing import Any
 import pytest
 import yaml
 
-from protos.base.errors import ConfigError
-from sidecar.config.sidecar import parse_config
+from plr.protos.base.errors import ConfigError
+from plr.sidecar.config.sidecar import parse_config
 from tests.unit.sidecar.configs import BACKED, CLOUD, ROBOT, SAFE, SOURCE, parse, with_service
 
 BAD_VALUES: list[tuple[dict[str, Any], str, str]] = [

@@ -4,12 +4,12 @@ from typing import Any
 
 import pytest
 
-from protos.model.ids import InterfaceName, ServiceName
-from protos.model.members import AT_MOST_EVERY_INTERFACE, EVERY_INTERFACE, Copies, InterfaceLabel
-from protos.model.redundancy_mode import RedundancyMode
-from sidecar.core.base.values import Priority
-from sidecar.core.rules.budget import Budget
-from sidecar.core.rules.service_rule import FallbackRule
+from plr.protos.model.ids import InterfaceName, ServiceName
+from plr.protos.model.members import AT_MOST_EVERY_INTERFACE, EVERY_INTERFACE, Copies, InterfaceLabel
+from plr.protos.model.redundancy_mode import RedundancyMode
+from plr.sidecar.core.base.values import Priority
+from plr.sidecar.core.rules.budget import Budget
+from plr.sidecar.core.rules.service_rule import FallbackRule
 from tests.unit.sidecar.configs import CLOUD, ROBOT, SAFE, parse, with_service
 
 

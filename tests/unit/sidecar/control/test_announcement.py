@@ -6,14 +6,14 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from controlplane.ca import Authority
-from protos.convert import parse_sidecar_message, sidecar_message_to_proto
-from protos.model.ids import InterfaceId, InterfaceName, SessionId
-from protos.model.members import Candidate, CandidateKind, CandidateSet, InterfaceLabel
-from protos.program.tls_files import load_tls_files
-from protos.trust.candidate_signature import verify_candidates
-from protos.trust.identity import IdentityRole
-from sidecar.control.announcement import Announcer
+from plr.controlplane.ca import Authority
+from plr.protos.convert import parse_sidecar_message, sidecar_message_to_proto
+from plr.protos.model.ids import InterfaceId, InterfaceName, SessionId
+from plr.protos.model.members import Candidate, CandidateKind, CandidateSet, InterfaceLabel
+from plr.protos.program.tls_files import load_tls_files
+from plr.protos.trust.candidate_signature import verify_candidates
+from plr.protos.trust.identity import IdentityRole
+from plr.sidecar.control.announcement import Announcer
 
 if TYPE_CHECKING:
     from collections.abc import Iterable

@@ -4,7 +4,7 @@ import logging
 
 import pytest
 
-from sidecar.control.outage_log import REPEATED_FAILURE_LOG_S, OutageLog
+from plr.sidecar.control.outage_log import REPEATED_FAILURE_LOG_S, OutageLog
 
 LOG = logging.getLogger("outage")
 

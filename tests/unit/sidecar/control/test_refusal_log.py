@@ -5,8 +5,8 @@ from __future__ import annotations
 import logging
 from typing import TYPE_CHECKING
 
-from protos.model.stream import ResourceKind
-from sidecar.control.refusal_log import RefusalLog
+from plr.protos.model.stream import ResourceKind
+from plr.sidecar.control.refusal_log import RefusalLog
 
 if TYPE_CHECKING:
     import pytest

@@ -4,25 +4,25 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from sidecar.core.base.request_id import OBSERVED_ONE_IN
-from sidecar.core.base.values import PathId, PathState, Priority, RejectReason, RequestId
-from sidecar.core.robot.dispatch.context import RequestParts
-from sidecar.core.robot.measure.measurements import Measurements
-from sidecar.core.robot.request.mapping_table import MappingTable
-from sidecar.core.robot.request.service_catalog import Offers
-from sidecar.core.robot.request_table import RequestTable
-from sidecar.core.rules.service_rule import Rules, ServiceRule
-from sidecar.core.seam.application import ApplicationEvent, RequestFailed, ResponseArrived
-from sidecar.core.seam.links import LinkCommand, Send
-from sidecar.core.seam.stats import EngineStats
-from sidecar.core.transfer.outbox import Outbox
-from sidecar.core.transfer.routes import Routes
-from sidecar.core.wire.messages import CancelMessage, RejectionMessage, ResponseMessage, decode_message
+from plr.sidecar.core.base.request_id import OBSERVED_ONE_IN
+from plr.sidecar.core.base.values import PathId, PathState, Priority, RejectReason, RequestId
+from plr.sidecar.core.robot.dispatch.context import RequestParts
+from plr.sidecar.core.robot.measure.measurements import Measurements
+from plr.sidecar.core.robot.request.mapping_table import MappingTable
+from plr.sidecar.core.robot.request.service_catalog import Offers
+from plr.sidecar.core.robot.request_table import RequestTable
+from plr.sidecar.core.rules.service_rule import Rules, ServiceRule
+from plr.sidecar.core.seam.application import ApplicationEvent, RequestFailed, ResponseArrived
+from plr.sidecar.core.seam.links import LinkCommand, Send
+from plr.sidecar.core.seam.stats import EngineStats
+from plr.sidecar.core.transfer.outbox import Outbox
+from plr.sidecar.core.transfer.routes import Routes
+from plr.sidecar.core.wire.messages import CancelMessage, RejectionMessage, ResponseMessage, decode_message
 from tests.support.builders import ECHO, TYPE, WLAN, WWAN, A, B, path, peer, request_id
 
 if TYPE_CHECKING:
-    from protos.model.ids import NodeName
-    from sidecar.core.rules.budget import Budget
+    from plr.protos.model.ids import NodeName
+    from plr.sidecar.core.rules.budget import Budget
 
 WLAN_A, WWAN_B = path(WLAN, A), path(WWAN, B)
 SERVERS = {A: WLAN_A, B: WWAN_B}

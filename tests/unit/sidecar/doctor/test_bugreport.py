@@ -11,11 +11,11 @@ import pytest
 import yaml
 from prometheus_client import CollectorRegistry, Gauge
 
-from protos.program.metrics_server import MetricsServer
-from sidecar.config.sidecar import load_config
-from sidecar.doctor import bugreport
-from sidecar.doctor.examination import Examination, Where
-from sidecar.doctor.finding import fail
+from plr.protos.program.metrics_server import MetricsServer
+from plr.sidecar.config.sidecar import load_config
+from plr.sidecar.doctor import bugreport
+from plr.sidecar.doctor.examination import Examination, Where
+from plr.sidecar.doctor.finding import fail
 from tests.unit.sidecar.configs import ROBOT
 
 if TYPE_CHECKING:

@@ -11,22 +11,30 @@ from typing import TYPE_CHECKING
 import pytest
 import yaml
 
-from controlplane.ca import Authority
-from protos.base.errors import ConfigError
-from protos.program import tls_files
-from protos.program.tls_files import load_tls_files
-from protos.trust.identity import IdentityRole
-from sidecar.doctor import examination
-from sidecar.doctor.examination import RUNTIME_SOCKET, Where, _certificate_and_clock, _judged, _wrong, connect, sockets
-from sidecar.doctor.finding import Level
-from sidecar.doctor.running_checks import paths
-from sidecar.local.client import LocalError, LocalRefusedError
+from plr.controlplane.ca import Authority
+from plr.protos.base.errors import ConfigError
+from plr.protos.program import tls_files
+from plr.protos.program.tls_files import load_tls_files
+from plr.protos.trust.identity import IdentityRole
+from plr.sidecar.doctor import examination
+from plr.sidecar.doctor.examination import (
+    RUNTIME_SOCKET,
+    Where,
+    _certificate_and_clock,
+    _judged,
+    _wrong,
+    connect,
+    sockets,
+)
+from plr.sidecar.doctor.finding import Level
+from plr.sidecar.doctor.running_checks import paths
+from plr.sidecar.local.client import LocalError, LocalRefusedError
 from tests.unit.sidecar.configs import ROBOT, parse
 
 if TYPE_CHECKING:
     from typing import Any, NoReturn
 
-    from sidecar.config.sidecar import SidecarConfig
+    from plr.sidecar.config.sidecar import SidecarConfig
 
 pytestmark = pytest.mark.audit("ops-14")
 

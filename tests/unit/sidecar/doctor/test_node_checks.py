@@ -8,14 +8,14 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from controlplane.ca import Authority
-from protos.model.ids import InterfaceName
-from protos.program.tls_files import load_tls_files
-from protos.trust.identity import IdentityRole
-from sidecar.doctor import node_checks
-from sidecar.doctor.finding import Finding, Level
-from sidecar.doctor.host import ClockState, reverse_path_filter, unit_environment
-from sidecar.net.interfaces import Interface, choose
+from plr.controlplane.ca import Authority
+from plr.protos.model.ids import InterfaceName
+from plr.protos.program.tls_files import load_tls_files
+from plr.protos.trust.identity import IdentityRole
+from plr.sidecar.doctor import node_checks
+from plr.sidecar.doctor.finding import Finding, Level
+from plr.sidecar.doctor.host import ClockState, reverse_path_filter, unit_environment
+from plr.sidecar.net.interfaces import Interface, choose
 
 if TYPE_CHECKING:
     from collections.abc import Iterable

@@ -6,10 +6,10 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from sidecar.core.path.pmtu import LEAST_MTU
-from sidecar.doctor import running_checks
-from sidecar.doctor.finding import Finding, Level
-from sidecar.doctor.running_checks import Pinged
+from plr.sidecar.core.path.pmtu import LEAST_MTU
+from plr.sidecar.doctor import running_checks
+from plr.sidecar.doctor.finding import Finding, Level
+from plr.sidecar.doctor.running_checks import Pinged
 
 if TYPE_CHECKING:
     from collections.abc import Iterable

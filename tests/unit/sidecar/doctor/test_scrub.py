@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from sidecar.doctor.scrub import scrubbed, scrubbed_value
+from plr.sidecar.doctor.scrub import scrubbed, scrubbed_value
 
 if TYPE_CHECKING:
     from collections.abc import Callable

@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from sidecar.doctor import command, ping_command
-from sidecar.local.client import MAX_LINE_BYTES, LocalClient, LocalError
+from plr.sidecar.doctor import command, ping_command
+from plr.sidecar.local.client import MAX_LINE_BYTES, LocalClient, LocalError
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -110,7 +110,7 @@ def test_an_answer_without_end_costs_little_memory(
 
     impostor.say = without_end
     most_bytes = 1 << 20
-    monkeypatch.setattr("sidecar.local.client.MAX_STATE_BYTES", most_bytes)
+    monkeypatch.setattr("plr.sidecar.local.client.MAX_STATE_BYTES", most_bytes)
     tracemalloc.start()
     try:
         with (
@@ -147,7 +147,7 @@ def test_what_is_printed_moves_no_cursor(
         yield line(id=number, end=True)
 
     impostor.say = say
-    monkeypatch.setattr("sidecar.ros.environment.problem", lambda *_, **__: None)
+    monkeypatch.setattr("plr.sidecar.ros.environment.problem", lambda *_, **__: None)
     at = ["--socket", str(tmp_path / "s"), "--config", str(tmp_path / "none")]
     ping_command.main(["cloud-1", "-c", "1", *at])
     command.main(at)

@@ -13,10 +13,10 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from sidecar.local import entrance as entrance_module
-from sidecar.local.client import LocalClient
-from sidecar.local.entrance import Entrance, SocketLock
-from sidecar.local.server import LocalServer, LocalSocketError
+from plr.sidecar.local import entrance as entrance_module
+from plr.sidecar.local.client import LocalClient
+from plr.sidecar.local.entrance import Entrance, SocketLock
+from plr.sidecar.local.server import LocalServer, LocalSocketError
 from tests.unit.sidecar.local.world import NOBODY, Source
 
 if TYPE_CHECKING:

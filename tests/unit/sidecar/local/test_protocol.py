@@ -6,8 +6,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from protos.base.errors import DecodeError
-from sidecar.local.protocol import PingRequest, StateRequest, decode_request
+from plr.protos.base.errors import DecodeError
+from plr.sidecar.local.protocol import PingRequest, StateRequest, decode_request
 
 pytestmark = pytest.mark.audit("ops-14")
 

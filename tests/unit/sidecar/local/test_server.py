@@ -15,10 +15,10 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from sidecar.local import server as server_module
-from sidecar.local.client import LocalClient, LocalError
-from sidecar.local.entrance import for_group
-from sidecar.local.server import MAX_OWN, MAX_PINGS_OUT, STATES, LocalServer, LocalSocketError
+from plr.sidecar.local import server as server_module
+from plr.sidecar.local.client import LocalClient, LocalError
+from plr.sidecar.local.entrance import for_group
+from plr.sidecar.local.server import MAX_OWN, MAX_PINGS_OUT, STATES, LocalServer, LocalSocketError
 from tests.unit.sidecar.local.world import NOBODY, PATIENCE_S, ROOT, Source, raw, reachable, wait_until
 
 if TYPE_CHECKING:
@@ -120,7 +120,7 @@ def test_a_member_of_the_group_may_ask_and_others_may_not(
         for groups, allowed in (([group.gr_gid], True), ([], False)):
             script = f"""
 import os, sys, pathlib
-from sidecar.local.client import LocalClient, LocalError
+from plr.sidecar.local.client import LocalClient, LocalError
 os.setgroups({groups}); os.setgid({NOBODY}); os.setuid({NOBODY})
 try:
     print(LocalClient(pathlib.Path({str(server.path)!r})).state()["node"]["name"])

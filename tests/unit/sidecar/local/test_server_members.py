@@ -11,10 +11,10 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from sidecar.local import server as server_module
-from sidecar.local.client import LocalBusyError, LocalClient, LocalError
-from sidecar.local.entrance import for_group
-from sidecar.local.server import MAX_OF_A_USER, MAX_OWN, LocalServer
+from plr.sidecar.local import server as server_module
+from plr.sidecar.local.client import LocalBusyError, LocalClient, LocalError
+from plr.sidecar.local.entrance import for_group
+from plr.sidecar.local.server import MAX_OF_A_USER, MAX_OWN, LocalServer
 from tests.unit.sidecar.local.world import NOBODY, PATIENCE_S, Source, as_user, raw, wait_until
 
 if TYPE_CHECKING:
@@ -169,7 +169,7 @@ def test_a_full_house_is_called_busy(server: LocalServer) -> None:
 
 
 def test_a_queue_that_is_full_is_called_busy(server: LocalServer, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("sidecar.local.client.CONNECT_S", 1)
+    monkeypatch.setattr("plr.sidecar.local.client.CONNECT_S", 1)
     server._stopping = True
     server._ring()
     server._thread.join()

@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import pytest
 
-from sidecar.local.shares import MAX_USERS, Rate, Rates, Shares
+from plr.sidecar.local.shares import MAX_USERS, Rate, Rates, Shares
 
 pytestmark = pytest.mark.audit("ops-14")
 

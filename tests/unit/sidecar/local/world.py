@@ -10,14 +10,14 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from protos.model.ids import InterfaceId, InterfaceName, NodeName
-from sidecar.core.base.values import PathId
-from sidecar.core.link.pinging import Pong
+from plr.protos.model.ids import InterfaceId, InterfaceName, NodeName
+from plr.sidecar.core.base.values import PathId
+from plr.sidecar.core.link.pinging import Pong
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
-    from sidecar.local.server import LocalServer
+    from plr.sidecar.local.server import LocalServer
 
 PATIENCE_S = 20.0
 NOBODY = 65534
@@ -77,6 +77,6 @@ def as_user(user: int, groups: Sequence[int], script: str) -> subprocess.Popen[s
     """Run a script as another user, who is a member of these groups; it is killed by whoever leaves the `with`."""
     become = f"import os; os.setgroups({list(groups)}); os.setgid({NOBODY}); os.setuid({user})\n"
     # What it needs of the checkout is imported before: that user may not be able to read it.
-    imports = "import json, pathlib, socket, sys, time\nfrom sidecar.local.client import LocalClient, LocalError\n"
+    imports = "import json, pathlib, socket, sys, time\nfrom plr.sidecar.local.client import LocalClient, LocalError\n"
     argv = [sys.executable, "-c", imports + become + script]
     return subprocess.Popen(argv, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=ROOT)

@@ -10,15 +10,15 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from protos.model.ids import InterfaceName
-from sidecar.core.link.sender import Batch
-from sidecar.core.seam.stats import LinkStats
-from sidecar.net.batch_socket import ARENA_BYTES, RECEIVE_CALLS, ROOM_BYTES, BatchSocket
+from plr.protos.model.ids import InterfaceName
+from plr.sidecar.core.link.sender import Batch
+from plr.sidecar.core.seam.stats import LinkStats
+from plr.sidecar.net.batch_socket import ARENA_BYTES, RECEIVE_CALLS, ROOM_BYTES, BatchSocket
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from protos.model.ids import Address
+    from plr.protos.model.ids import Address
 
 PATIENCE_S = 20.0
 SEGMENT = 1200

@@ -13,20 +13,20 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from protos.model.ids import InterfaceName
-from sidecar.core.base.values import PathState
-from sidecar.core.control import ways
-from sidecar.core.control.session import ControlStats
-from sidecar.core.control.watch import CHEAPER, GONE, SILENT, Leave, Seen
-from sidecar.core.control.ways import STRANGER, ControlInterface, Price, Way
-from sidecar.net import control_attempts, control_dialer, control_sockets
-from sidecar.net.control_dialer import ControlDialer
+from plr.protos.model.ids import InterfaceName
+from plr.sidecar.core.base.values import PathState
+from plr.sidecar.core.control import ways
+from plr.sidecar.core.control.session import ControlStats
+from plr.sidecar.core.control.watch import CHEAPER, GONE, SILENT, Leave, Seen
+from plr.sidecar.core.control.ways import STRANGER, ControlInterface, Price, Way
+from plr.sidecar.net import control_attempts, control_dialer, control_sockets
+from plr.sidecar.net.control_dialer import ControlDialer
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable, Coroutine
 
-    from protos.model.ids import Address
-    from sidecar.net.control_dialer import ControlLine
+    from plr.protos.model.ids import Address
+    from plr.sidecar.net.control_dialer import ControlLine
 
 WAIT_S = 20.0
 WLAN, WWAN = InterfaceName("wlan0"), InterfaceName("wwan0")

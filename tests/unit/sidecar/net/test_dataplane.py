@@ -16,27 +16,27 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from protos.base.errors import DecodeError
-from protos.model.ids import InterfaceId, InterfaceName, NodeName, Role, ServiceName, SessionId, Version
-from protos.model.members import ALL_CALLS, MAX_PEERS, Candidate, CandidateKind, Peer, PeerSet, ServiceOffer
-from protos.trust.identity import NOT_YET_VALID, UNTRUSTED, CertificateError
-from protos.trust.pair_token import pair_token
-from sidecar.core.base.values import PathState, RequestId
-from sidecar.core.engine.engine import EngineConfig
-from sidecar.core.link.link import Link
-from sidecar.core.link.sender import Batch, LinkIdentity
-from sidecar.core.rules.service_rule import ServiceRule
-from sidecar.core.seam.application import ApplicationEvent, ExecuteRequest, OfferService, ResponseArrived
-from sidecar.core.seam.links import SetReady
-from sidecar.net.dataplane import DataPlaneHooks, ThreadedDataPlane
-from sidecar.net.interface_thread import BLOCKED_TIMER_S, InterfaceThread
+from plr.protos.base.errors import DecodeError
+from plr.protos.model.ids import InterfaceId, InterfaceName, NodeName, Role, ServiceName, SessionId, Version
+from plr.protos.model.members import ALL_CALLS, MAX_PEERS, Candidate, CandidateKind, Peer, PeerSet, ServiceOffer
+from plr.protos.trust.identity import NOT_YET_VALID, UNTRUSTED, CertificateError
+from plr.protos.trust.pair_token import pair_token
+from plr.sidecar.core.base.values import PathState, RequestId
+from plr.sidecar.core.engine.engine import EngineConfig
+from plr.sidecar.core.link.link import Link
+from plr.sidecar.core.link.sender import Batch, LinkIdentity
+from plr.sidecar.core.rules.service_rule import ServiceRule
+from plr.sidecar.core.seam.application import ApplicationEvent, ExecuteRequest, OfferService, ResponseArrived
+from plr.sidecar.core.seam.links import SetReady
+from plr.sidecar.net.dataplane import DataPlaneHooks, ThreadedDataPlane
+from plr.sidecar.net.interface_thread import BLOCKED_TIMER_S, InterfaceThread
 from tests.support.sessions import session_of
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from protos.trust.credential import SessionCredential
-    from sidecar.core.link.pinging import Pong
+    from plr.protos.trust.credential import SessionCredential
+    from plr.sidecar.core.link.pinging import Pong
 
 SERVICE, TYPE = ServiceName("/echo"), "t/srv/Echo"
 PATIENCE_S = 20.0

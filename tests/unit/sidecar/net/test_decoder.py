@@ -8,24 +8,24 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from protos.model.ids import InterfaceName, Role, SessionId, Version
-from protos.model.members import PeerSet, ServiceOffer
-from sidecar.core.base.values import Priority
-from sidecar.core.engine.engine import EngineConfig
-from sidecar.core.message.decoding import Decoding
-from sidecar.core.message.outbound import OutboundMessage
-from sidecar.core.message.partial import Partial
-from sidecar.core.seam.application import ExecuteRequest
-from sidecar.core.seam.links import FragmentsReceived
-from sidecar.core.wire.frame import Fragment
-from sidecar.core.wire.messages import RequestMessage, encode_message
-from sidecar.net.dataplane import DataPlaneHooks, ThreadedDataPlane
-from sidecar.net.decoder import Decoder
+from plr.protos.model.ids import InterfaceName, Role, SessionId, Version
+from plr.protos.model.members import PeerSet, ServiceOffer
+from plr.sidecar.core.base.values import Priority
+from plr.sidecar.core.engine.engine import EngineConfig
+from plr.sidecar.core.message.decoding import Decoding
+from plr.sidecar.core.message.outbound import OutboundMessage
+from plr.sidecar.core.message.partial import Partial
+from plr.sidecar.core.seam.application import ExecuteRequest
+from plr.sidecar.core.seam.links import FragmentsReceived
+from plr.sidecar.core.wire.frame import Fragment
+from plr.sidecar.core.wire.messages import RequestMessage, encode_message
+from plr.sidecar.net.dataplane import DataPlaneHooks, ThreadedDataPlane
+from plr.sidecar.net.decoder import Decoder
 from tests.support.builders import ECHO, TYPE, path, peer, request_id, rule
 from tests.support.sessions import session_of
 
 if TYPE_CHECKING:
-    from sidecar.core.seam.application import ApplicationEvent
+    from plr.sidecar.core.seam.application import ApplicationEvent
 
 PATIENCE_S = 20.0
 """For a loaded machine; nothing here takes long."""

@@ -8,13 +8,13 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from sidecar.net import host_names
-from sidecar.net.host_names import HostNames
+from plr.sidecar.net import host_names
+from plr.sidecar.net.host_names import HostNames
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from protos.model.ids import Address
+    from plr.protos.model.ids import Address
 
 TIMEOUT_S = 30.0
 

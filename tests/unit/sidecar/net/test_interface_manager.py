@@ -7,22 +7,22 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from protos.model.ids import InterfaceName, Role
-from sidecar.config.service import ServiceConfig
-from sidecar.config.sidecar import SidecarConfig, StunConfig
-from sidecar.core.interfaces.scan_schedule import RETRY_S
-from sidecar.core.seam.links import SetCarrier
-from sidecar.net import interface_manager as module
-from sidecar.net.interface_manager import InterfaceManager
-from sidecar.net.interfaces import Interface
-from sidecar.net.netlink_watch import Changes
+from plr.protos.model.ids import InterfaceName, Role
+from plr.sidecar.config.service import ServiceConfig
+from plr.sidecar.config.sidecar import SidecarConfig, StunConfig
+from plr.sidecar.core.interfaces.scan_schedule import RETRY_S
+from plr.sidecar.core.seam.links import SetCarrier
+from plr.sidecar.net import interface_manager as module
+from plr.sidecar.net.interface_manager import InterfaceManager
+from plr.sidecar.net.interfaces import Interface
+from plr.sidecar.net.netlink_watch import Changes
 from tests.support.sessions import session_of
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from protos.model.members import Candidate
-    from sidecar.net.interface_thread import InterfaceThread
+    from plr.protos.model.members import Candidate
+    from plr.sidecar.net.interface_thread import InterfaceThread
 
 LO = Interface(InterfaceName("lo"), 1, "", up=True, carrier=True, mtu=65536, addresses=("127.0.0.1",))
 IDLE = Changes(any=False, gone_links=frozenset())

@@ -6,18 +6,18 @@ import threading
 import time
 from typing import TYPE_CHECKING, Any
 
-from protos.model.ids import InterfaceId, InterfaceName, Role
-from sidecar.core.link.link import Link
-from sidecar.core.link.sender import Batch, LinkIdentity
-from sidecar.net.interface_thread import InterfaceThread
+from plr.protos.model.ids import InterfaceId, InterfaceName, Role
+from plr.sidecar.core.link.link import Link
+from plr.sidecar.core.link.sender import Batch, LinkIdentity
+from plr.sidecar.net.interface_thread import InterfaceThread
 from tests.support.sessions import credential_of
 
 if TYPE_CHECKING:
     import pytest
 
-    from sidecar.core.link.pinging import Pong
-    from sidecar.core.seam.links import LinkEvent
-    from sidecar.core.stun.events import StunEvent
+    from plr.sidecar.core.link.pinging import Pong
+    from plr.sidecar.core.seam.links import LinkEvent
+    from plr.sidecar.core.stun.events import StunEvent
 
 PATIENCE_S = 20.0
 

@@ -4,9 +4,16 @@ from dataclasses import replace
 
 import pytest
 
-from protos.model.ids import InterfaceName
-from sidecar.core.seam.links import Rebind
-from sidecar.net.interfaces import LOOPBACK, Interface, SkippedInterface, choose, list_interfaces, missing_interfaces
+from plr.protos.model.ids import InterfaceName
+from plr.sidecar.core.seam.links import Rebind
+from plr.sidecar.net.interfaces import (
+    LOOPBACK,
+    Interface,
+    SkippedInterface,
+    choose,
+    list_interfaces,
+    missing_interfaces,
+)
 
 WLAN = Interface(
     InterfaceName("wlan0"),

@@ -7,7 +7,7 @@ import time
 
 import pytest
 
-from sidecar.net.netlink_watch import (
+from plr.sidecar.net.netlink_watch import (
     RTM_DELADDR,
     RTM_DELLINK,
     RTM_DELROUTE,

@@ -5,10 +5,10 @@ from __future__ import annotations
 import logging
 from typing import TYPE_CHECKING
 
-from protos.model.ids import InterfaceId, InterfaceName, NodeName
-from sidecar.core.base.values import PathId, PathState
-from sidecar.core.seam.links import PathChanged
-from sidecar.net.path_log import PathLog
+from plr.protos.model.ids import InterfaceId, InterfaceName, NodeName
+from plr.sidecar.core.base.values import PathId, PathState
+from plr.sidecar.core.seam.links import PathChanged
+from plr.sidecar.net.path_log import PathLog
 
 if TYPE_CHECKING:
     import pytest

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sidecar.net.sockets import normalise, to_sockaddr
+from plr.sidecar.net.sockets import normalise, to_sockaddr
 
 
 @pytest.mark.parametrize(

@@ -6,13 +6,13 @@ import time
 
 import pytest
 
-from protos.model.ids import InterfaceId, InterfaceName, NodeName, Role
-from sidecar.core.base.values import PathId, PathState
-from sidecar.core.link.link import Link
-from sidecar.core.link.sender import LinkIdentity
-from sidecar.core.seam.links import PathChanged
-from sidecar.net.interface_thread import InterfaceThread
-from sidecar.net.sources import Sources
+from plr.protos.model.ids import InterfaceId, InterfaceName, NodeName, Role
+from plr.sidecar.core.base.values import PathId, PathState
+from plr.sidecar.core.link.link import Link
+from plr.sidecar.core.link.sender import LinkIdentity
+from plr.sidecar.core.seam.links import PathChanged
+from plr.sidecar.net.interface_thread import InterfaceThread
+from plr.sidecar.net.sources import Sources
 from tests.support.sessions import credential_of
 from tests.unit.sidecar.net.test_interface_thread import Owner
 

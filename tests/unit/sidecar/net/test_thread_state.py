@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from sidecar.net.thread_state import is_in_a_call
+from plr.sidecar.net.thread_state import is_in_a_call
 
 if TYPE_CHECKING:
     from collections.abc import Callable

@@ -6,7 +6,7 @@ import time
 
 import pytest
 
-from sidecar.net.timerfd import NEVER, Timer
+from plr.sidecar.net.timerfd import NEVER, Timer
 
 PATIENCE_S = 20.0
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from sidecar.net.waiter import EARLY_S, Waiter
+from plr.sidecar.net.waiter import EARLY_S, Waiter
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

@@ -2,10 +2,10 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, cast
 
-from sidecar.net.watchdog import HUNG_AFTER_S, LOOK_EVERY_S, Changes, Watchdog
+from plr.sidecar.net.watchdog import HUNG_AFTER_S, LOOK_EVERY_S, Changes, Watchdog
 
 if TYPE_CHECKING:
-    from sidecar.net.interface_thread import InterfaceThread
+    from plr.sidecar.net.interface_thread import InterfaceThread
 
 
 class FakeThread:

@@ -10,17 +10,17 @@ import pytest
 from prometheus_client import CollectorRegistry, generate_latest
 from prometheus_client.parser import text_string_to_metric_families
 
-from protos.base.histogram import Histogram
-from protos.model.ids import InterfaceName, NodeName, ServiceName
-from protos.model.stream import ResourceKind
-from sidecar.core.control.session import ControlStats
-from sidecar.core.seam.stats import EngineStats, LinkStats, PathStats
-from sidecar.observe.metric_families import DURATION_BOUNDS_S, cumulative
-from sidecar.observe.metrics import MetricSources, SidecarCollector, serve_metrics
-from sidecar.ros.stats import BridgeStats
+from plr.protos.base.histogram import Histogram
+from plr.protos.model.ids import InterfaceName, NodeName, ServiceName
+from plr.protos.model.stream import ResourceKind
+from plr.sidecar.core.control.session import ControlStats
+from plr.sidecar.core.seam.stats import EngineStats, LinkStats, PathStats
+from plr.sidecar.observe.metric_families import DURATION_BOUNDS_S, cumulative
+from plr.sidecar.observe.metrics import MetricSources, SidecarCollector, serve_metrics
+from plr.sidecar.ros.stats import BridgeStats
 
 if TYPE_CHECKING:
-    from protos.program.metrics_server import MetricsServer
+    from plr.protos.program.metrics_server import MetricsServer
 
 PLAN = ServiceName("/plan")
 WLAN = InterfaceName("wlan0")

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from protos.model.ids import ServiceName
-from sidecar.observe.unmet_services import (
+from plr.protos.model.ids import ServiceName
+from plr.sidecar.observe.unmet_services import (
     GRACE_S,
     MAX_NAMES_SHOWN,
     UnmetServices,

@@ -9,8 +9,8 @@ from dataclasses import dataclass, field
 from itertools import count
 from typing import TYPE_CHECKING
 
-from sidecar.core.base.values import Priority
-from sidecar.ros.cloud.request_window import RequestWindow
+from plr.sidecar.core.base.values import Priority
+from plr.sidecar.ros.cloud.request_window import RequestWindow
 
 if TYPE_CHECKING:
     from collections.abc import Callable

@@ -4,13 +4,13 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from protos.model.ids import NodeName, ServiceName
-from sidecar.core.base.values import ExecutionId, Priority
-from sidecar.core.seam.application import AbandonExecution, CancelExecution, ExecuteRequest, WithdrawService
-from sidecar.ros.event_queue import EventQueue
+from plr.protos.model.ids import NodeName, ServiceName
+from plr.sidecar.core.base.values import ExecutionId, Priority
+from plr.sidecar.core.seam.application import AbandonExecution, CancelExecution, ExecuteRequest, WithdrawService
+from plr.sidecar.ros.event_queue import EventQueue
 
 if TYPE_CHECKING:
-    from sidecar.core.seam.application import ApplicationEvent
+    from plr.sidecar.core.seam.application import ApplicationEvent
 
 GREEDY, HONEST = NodeName("greedy"), NodeName("honest")
 GONE = WithdrawService(ServiceName("/plan"), "its server is gone")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 from typing import TYPE_CHECKING
 
-from sidecar.ros.log_limit import MAX_KINDS, LimitedLog
+from plr.sidecar.ros.log_limit import MAX_KINDS, LimitedLog
 
 if TYPE_CHECKING:
     import pytest

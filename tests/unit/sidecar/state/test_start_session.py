@@ -9,23 +9,23 @@ from typing import TYPE_CHECKING
 import pytest
 from cryptography.hazmat.primitives.asymmetric import ec
 
-from controlplane.ca import Authority
-from controlplane.ca.files import write_tls_files
-from protos.base.errors import ConfigError, DecodeError
-from protos.model.ids import Role, SessionId
-from protos.model.members import Peer
-from protos.program.tls_files import TlsFiles, load_tls_files
-from protos.trust.clock_floor import ClockFloor
-from protos.trust.credential import SessionCredential, verify
-from protos.trust.identity import MALFORMED, REVOKED, UNTRUSTED, WRONG_ROLE, CertificateError, IdentityRole, Trust
-from sidecar.core.wire.introduction import MAX_INTRODUCED_BYTES
-from sidecar.state import start_session as module
-from sidecar.state.start_session import preferred_aead, signed, start_session
+from plr.controlplane.ca import Authority
+from plr.controlplane.ca.files import write_tls_files
+from plr.protos.base.errors import ConfigError, DecodeError
+from plr.protos.model.ids import Role, SessionId
+from plr.protos.model.members import Peer
+from plr.protos.program.tls_files import TlsFiles, load_tls_files
+from plr.protos.trust.clock_floor import ClockFloor
+from plr.protos.trust.credential import SessionCredential, verify
+from plr.protos.trust.identity import MALFORMED, REVOKED, UNTRUSTED, WRONG_ROLE, CertificateError, IdentityRole, Trust
+from plr.sidecar.core.wire.introduction import MAX_INTRODUCED_BYTES
+from plr.sidecar.state import start_session as module
+from plr.sidecar.state.start_session import preferred_aead, signed, start_session
 
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from sidecar.core.crypto.session import OwnSession
+    from plr.sidecar.core.crypto.session import OwnSession
 
 TOKEN = bytes(16)
 

@@ -12,14 +12,14 @@ from typing import IO, TYPE_CHECKING
 
 import pytest
 
-from protos.base.errors import DecodeError
-from protos.model.ids import InterfaceId, InterfaceName, NodeName, Role, ServiceName, SessionId, Version
-from protos.model.mapping import Assignment, MappingSet, ServiceMapping
-from protos.model.members import Candidate, CandidateKind, Peer, PeerSet, ServiceOffer
-from protos.model.stream import Welcome
-from protos.program import own_folder
-from sidecar.state import store as state_store
-from sidecar.state.file import (
+from plr.protos.base.errors import DecodeError
+from plr.protos.model.ids import InterfaceId, InterfaceName, NodeName, Role, ServiceName, SessionId, Version
+from plr.protos.model.mapping import Assignment, MappingSet, ServiceMapping
+from plr.protos.model.members import Candidate, CandidateKind, Peer, PeerSet, ServiceOffer
+from plr.protos.model.stream import Welcome
+from plr.protos.program import own_folder
+from plr.sidecar.state import store as state_store
+from plr.sidecar.state.file import (
     ControlAddresses,
     Identity,
     LastGood,
@@ -30,7 +30,7 @@ from sidecar.state.file import (
     encode_identity,
     encode_last_good,
 )
-from sidecar.state.store import (
+from plr.sidecar.state.store import (
     ADDRESSES_FILE,
     CLOCK_FILE,
     IDENTITY_FILE,
@@ -311,9 +311,9 @@ def test_what_did_not_fit_on_a_full_disk_is_written_when_there_is_room(
 WRITE_FOR_EVER = """
 import itertools, sys
 from pathlib import Path
-import sidecar.state.store as state_store
-from protos.model.ids import NodeName, Version
-from protos.model.mapping import MappingSet
+import plr.sidecar.state.store as state_store
+from plr.protos.model.ids import NodeName, Version
+from plr.protos.model.mapping import MappingSet
 state_store.MIN_WRITE_INTERVAL_S = 0.0
 store = state_store.StateStore(Path(sys.argv[1]), NodeName("robot-1"))
 busy = False
@@ -363,9 +363,9 @@ def test_a_card_gone_read_only_still_yields_the_last_mapping(tmp_path: Path) -> 
 OPEN_AND_REMEMBER = """
 import sys
 from pathlib import Path
-from protos.model.ids import NodeName, Version
-from protos.model.mapping import MappingSet
-from sidecar.state.store import StateStore
+from plr.protos.model.ids import NodeName, Version
+from plr.protos.model.mapping import MappingSet
+from plr.sidecar.state.store import StateStore
 store = StateStore(Path(sys.argv[1]), NodeName("robot-1"))
 sys.stdout.write(str(store.last_good.mapping and store.last_good.mapping.version) + " ")
 store.remember(MappingSet(Version(int(sys.argv[2])), 0))

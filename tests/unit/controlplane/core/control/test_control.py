@@ -6,12 +6,12 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from controlplane.core.publish.publisher import INFORM_S
-from protos.model.ids import NodeName, Version
-from protos.model.members import ServiceSet
-from protos.model.report import OutcomeReport, Report
-from protos.model.status import SyncState
-from protos.model.stream import Heartbeat
+from plr.controlplane.core.publish.publisher import INFORM_S
+from plr.protos.model.ids import NodeName, Version
+from plr.protos.model.members import ServiceSet
+from plr.protos.model.report import OutcomeReport, Report
+from plr.protos.model.status import SyncState
+from plr.protos.model.stream import Heartbeat
 from tests.support.control_world import SETTLED_S
 from tests.support.samples import PLAN, histogram, interfaces, latency, offer, path, use
 

@@ -6,11 +6,11 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from controlplane.core.publish.publisher import RESEND_S
-from protos.model.mapping import MappingSet
-from protos.model.members import PeerSet, RemovalReason
-from protos.model.status import SyncState
-from protos.model.stream import Ack, ResourceKind
+from plr.controlplane.core.publish.publisher import RESEND_S
+from plr.protos.model.mapping import MappingSet
+from plr.protos.model.members import PeerSet, RemovalReason
+from plr.protos.model.status import SyncState
+from plr.protos.model.stream import Ack, ResourceKind
 from tests.support.control_world import SETTLED_S
 
 if TYPE_CHECKING:

@@ -7,13 +7,13 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from controlplane.core.control import control
-from controlplane.core.estimate.estimator import Estimator
-from controlplane.core.formulation import problem_builder
-from controlplane.core.publish.publisher import INFORM_S
-from protos.model.mapping import MappingSet
-from protos.model.members import PeerSet
-from protos.model.stream import Heartbeat
+from plr.controlplane.core.control import control
+from plr.controlplane.core.estimate.estimator import Estimator
+from plr.controlplane.core.formulation import problem_builder
+from plr.controlplane.core.publish.publisher import INFORM_S
+from plr.protos.model.mapping import MappingSet
+from plr.protos.model.members import PeerSet
+from plr.protos.model.stream import Heartbeat
 from tests.support.control_world import SETTLED_S
 from tests.support.samples import path
 

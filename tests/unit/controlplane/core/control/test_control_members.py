@@ -6,14 +6,14 @@ import dataclasses
 
 import pytest
 
-from controlplane.core.control import control
-from controlplane.core.publish.messages import CloseReason
-from controlplane.core.registry.registry import Refusal
-from protos.base.errors import DecodeError
-from protos.model.ids import NodeName, Role
-from protos.model.members import CandidateSet, RemovalReason, ServiceSet
-from protos.model.status import SyncState
-from protos.model.stream import Drain
+from plr.controlplane.core.control import control
+from plr.controlplane.core.publish.messages import CloseReason
+from plr.controlplane.core.registry.registry import Refusal
+from plr.protos.base.errors import DecodeError
+from plr.protos.model.ids import NodeName, Role
+from plr.protos.model.members import CandidateSet, RemovalReason, ServiceSet
+from plr.protos.model.status import SyncState
+from plr.protos.model.stream import Drain
 from tests.support.control_world import SETTLED_S, World
 from tests.support.samples import interfaces, offer, registration
 

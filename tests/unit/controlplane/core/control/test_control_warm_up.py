@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import pytest
 
-from controlplane.core.control.events import Settings
-from protos.convert import parse_in_parts, sidecar_message_to_proto
-from protos.convert.reports import PART_ENTRIES
-from protos.model.ids import NodeName, Role
-from protos.model.members import CandidateSet, ServiceSet
-from protos.model.report import Report
+from plr.controlplane.core.control.events import Settings
+from plr.protos.convert import parse_in_parts, sidecar_message_to_proto
+from plr.protos.convert.reports import PART_ENTRIES
+from plr.protos.model.ids import NodeName, Role
+from plr.protos.model.members import CandidateSet, ServiceSet
+from plr.protos.model.report import Report
 from tests.support.control_world import SimSidecar, World
 from tests.support.samples import interfaces, path, registration, use
 

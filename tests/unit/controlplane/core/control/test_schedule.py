@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from controlplane.core.control.schedule import (
+from plr.controlplane.core.control.schedule import (
     ROBOTS_TIMES,
     ROBOTS_WAIT_S,
     ROUTINE_INTERVAL_S,

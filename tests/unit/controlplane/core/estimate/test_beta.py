@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy.stats import beta
 
-from controlplane.core.estimate.beta import intervals, quantiles
-from controlplane.core.estimate.posterior import Estimate
+from plr.controlplane.core.estimate.beta import intervals, quantiles
+from plr.controlplane.core.estimate.posterior import Estimate
 
 
 @pytest.mark.parametrize("share", [0.05, 0.5, 0.95])

@@ -6,9 +6,9 @@ import random
 
 import pytest
 
-from controlplane.core.estimate.processing import ComputeTimes
-from protos.base.histogram import Histogram
-from protos.model.ids import NodeName
+from plr.controlplane.core.estimate.processing import ComputeTimes
+from plr.protos.base.histogram import Histogram
+from plr.protos.model.ids import NodeName
 from tests.support.samples import PLAN, histogram
 
 A, B, C = (NodeName(name) for name in "abc")

@@ -9,8 +9,8 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from controlplane.core.estimate.distribution import Distribution
-from controlplane.core.estimate.fading import FadedHistogram
+from plr.controlplane.core.estimate.distribution import Distribution
+from plr.controlplane.core.estimate.fading import FadedHistogram
 from tests.support.samples import histogram
 
 values = st.lists(st.floats(0.0, 100.0), min_size=1, max_size=20)

@@ -7,17 +7,17 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from controlplane.core.estimate import estimator as estimator_module
-from controlplane.core.estimate import network as network_module
-from controlplane.core.estimate import processing as compute_module
-from controlplane.core.estimate.estimator import LIVE_S, Estimator
-from protos.model.ids import InterfaceName, NodeName, ServiceName
-from protos.model.mapping import Assignment
-from protos.model.report import InterfaceJointReport, JointReport, LatencyReport, OutcomeReport, PathReport, Report
+from plr.controlplane.core.estimate import estimator as estimator_module
+from plr.controlplane.core.estimate import network as network_module
+from plr.controlplane.core.estimate import processing as compute_module
+from plr.controlplane.core.estimate.estimator import LIVE_S, Estimator
+from plr.protos.model.ids import InterfaceName, NodeName, ServiceName
+from plr.protos.model.mapping import Assignment
+from plr.protos.model.report import InterfaceJointReport, JointReport, LatencyReport, OutcomeReport, PathReport, Report
 from tests.support.samples import PLAN, histogram, latency, path
 
 if TYPE_CHECKING:
-    from controlplane.core.estimate.posterior import Estimate
+    from plr.controlplane.core.estimate.posterior import Estimate
 
 ROBOT = NodeName("robot")
 A, B = NodeName("cloud-a"), NodeName("cloud-b")

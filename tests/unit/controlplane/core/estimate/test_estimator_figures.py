@@ -10,15 +10,15 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pytest
 
-from controlplane.core.estimate.distribution import Distribution
-from controlplane.core.estimate.estimator import Estimator
-from controlplane.core.estimate.fading import FadedCount, FadedHistogram
-from controlplane.core.estimate.posterior import IGNORANCE, MEMORIES, SCORE_HALF_LIFE, Estimate, FadedTrials
-from controlplane.core.estimate.witnesses import COUNTS_ANYWAY, MAX_WITNESSES, MOST_ALONE, Witnesses
-from protos.base.histogram import BUCKETS, EDGES, MAX_S, MIDS, Histogram
-from protos.convert import parse_sidecar_message, sidecar_message_to_proto
-from protos.model.ids import NodeName
-from protos.model.report import Report
+from plr.controlplane.core.estimate.distribution import Distribution
+from plr.controlplane.core.estimate.estimator import Estimator
+from plr.controlplane.core.estimate.fading import FadedCount, FadedHistogram
+from plr.controlplane.core.estimate.posterior import IGNORANCE, MEMORIES, SCORE_HALF_LIFE, Estimate, FadedTrials
+from plr.controlplane.core.estimate.witnesses import COUNTS_ANYWAY, MAX_WITNESSES, MOST_ALONE, Witnesses
+from plr.protos.base.histogram import BUCKETS, EDGES, MAX_S, MIDS, Histogram
+from plr.protos.convert import parse_sidecar_message, sidecar_message_to_proto
+from plr.protos.model.ids import NodeName
+from plr.protos.model.report import Report
 from tests.unit.controlplane.drawn_reports import DEADLINES_S, INTERFACES, ROBOTS, SERVERS, SERVICES, drawn_reports
 
 if TYPE_CHECKING:

@@ -8,10 +8,10 @@ import random
 import numpy as np
 import pytest
 
-from controlplane.core.estimate.fading import FadedCount, FadedHistogram, FadedShares
-from protos.base.histogram import MAX_COUNT, Histogram
-from protos.base.size_class import SIZE_CLASSES
-from protos.model.explanation import SAMPLE
+from plr.controlplane.core.estimate.fading import FadedCount, FadedHistogram, FadedShares
+from plr.protos.base.histogram import MAX_COUNT, Histogram
+from plr.protos.base.size_class import SIZE_CLASSES
+from plr.protos.model.explanation import SAMPLE
 from tests.support.samples import histogram
 
 HALF_LIFE_S = 60.0

@@ -4,16 +4,16 @@ from __future__ import annotations
 
 import pytest
 
-from controlplane.core.control.control import ControlCore
-from controlplane.core.control.events import Settings
-from controlplane.core.estimate.estimator import Estimator
-from controlplane.core.estimate.fading import FORGET_S, forget_after_s
-from controlplane.core.estimate.processing import ComputeTimes
-from controlplane.core.publish.messages import CloseReason
-from controlplane.core.registry.registry import Refusal
-from protos.model.ids import InterfaceName, NodeName, Role, ServiceName
-from protos.model.members import CandidateSet, ServiceSet
-from protos.model.report import OutcomeReport, Report
+from plr.controlplane.core.control.control import ControlCore
+from plr.controlplane.core.control.events import Settings
+from plr.controlplane.core.estimate.estimator import Estimator
+from plr.controlplane.core.estimate.fading import FORGET_S, forget_after_s
+from plr.controlplane.core.estimate.processing import ComputeTimes
+from plr.controlplane.core.publish.messages import CloseReason
+from plr.controlplane.core.registry.registry import Refusal
+from plr.protos.model.ids import InterfaceName, NodeName, Role, ServiceName
+from plr.protos.model.members import CandidateSet, ServiceSet
+from plr.protos.model.report import OutcomeReport, Report
 from tests.support.samples import PLAN, histogram, interfaces, latency, offer, path, registration, use
 
 pytestmark = pytest.mark.audit("ops-24h")

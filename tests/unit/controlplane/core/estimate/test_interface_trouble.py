@@ -2,9 +2,9 @@ from __future__ import annotations
 
 import pytest
 
-from controlplane.core.estimate.interface_trouble import InterfaceTrouble
-from controlplane.core.estimate.posterior import Estimate
-from protos.model.ids import InterfaceName, NodeName
+from plr.controlplane.core.estimate.interface_trouble import InterfaceTrouble
+from plr.controlplane.core.estimate.posterior import Estimate
+from plr.protos.model.ids import InterfaceName, NodeName
 
 WLAN = InterfaceName("wlan0")
 A, B = NodeName("cloud-a"), NodeName("cloud-b")

@@ -6,7 +6,7 @@ import random
 
 import pytest
 
-from controlplane.core.estimate.posterior import BATCH_S, Estimate, FadedTrials
+from plr.controlplane.core.estimate.posterior import BATCH_S, Estimate, FadedTrials
 
 PRIOR = Estimate(0.5, 0.5)
 STEP_S = 0.5

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import pytest
 
-from controlplane.core.estimate import reached as module
-from controlplane.core.estimate.reached import Reached
-from protos.model.ids import NodeName
+from plr.controlplane.core.estimate import reached as module
+from plr.controlplane.core.estimate.reached import Reached
+from plr.protos.model.ids import NodeName
 
 pytestmark = pytest.mark.audit("ops-12")
 

@@ -7,16 +7,16 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from controlplane.core.estimate.shared_fate import HALF_LIFE_S, SharedFate
-from protos.model.explanation import Correlation
-from protos.model.ids import InterfaceName, ServiceName
-from protos.model.report import InterfaceJointReport
-from sidecar.core.robot.measure.measurements import InterfacePair, JointCounts, PairOutcome
+from plr.controlplane.core.estimate.shared_fate import HALF_LIFE_S, SharedFate
+from plr.protos.model.explanation import Correlation
+from plr.protos.model.ids import InterfaceName, ServiceName
+from plr.protos.model.report import InterfaceJointReport
+from plr.sidecar.core.robot.measure.measurements import InterfacePair, JointCounts, PairOutcome
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from controlplane.core.estimate.shared_fate import CommonMisses
+    from plr.controlplane.core.estimate.shared_fate import CommonMisses
 
 RATE_HZ = 5
 PAIR = InterfacePair(ServiceName("/plan"), InterfaceName("wlan0"), InterfaceName("wwan0"), None)

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import pytest
 
-from controlplane.core.estimate.fading import FadedHistogram
-from controlplane.core.estimate.posterior import Estimate, FadedTrials
-from controlplane.core.estimate.staleness import GRACE_S, HALF_LIFE_S, LONGEST_GAP_S, HeardClock, Silence
+from plr.controlplane.core.estimate.fading import FadedHistogram
+from plr.controlplane.core.estimate.posterior import Estimate, FadedTrials
+from plr.controlplane.core.estimate.staleness import GRACE_S, HALF_LIFE_S, LONGEST_GAP_S, HeardClock, Silence
 from tests.support.samples import histogram
 
 STEP_S = 0.5

@@ -4,9 +4,15 @@ from __future__ import annotations
 
 import pytest
 
-from controlplane.core.estimate.unanswered import LATELY_S, MAX_ANSWERED, MAX_WORDS_OF_ROBOT, REMEMBERED_S, Unanswered
-from protos.base.histogram import MAX_COUNT, Histogram
-from protos.model.ids import NodeName
+from plr.controlplane.core.estimate.unanswered import (
+    LATELY_S,
+    MAX_ANSWERED,
+    MAX_WORDS_OF_ROBOT,
+    REMEMBERED_S,
+    Unanswered,
+)
+from plr.protos.base.histogram import MAX_COUNT, Histogram
+from plr.protos.model.ids import NodeName
 from tests.support.samples import PLAN, histogram, latency
 
 pytestmark = pytest.mark.audit("ops-12")

@@ -9,10 +9,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from controlplane.core.estimate.processing import ComputeTimes
-from controlplane.core.estimate.witnesses import COUNTS_ANYWAY, MAX_WITNESSES, MOST_ALONE, Witnesses, thinned
-from protos.base.histogram import BUCKETS, MAX_COUNT, Histogram
-from protos.model.ids import NodeName
+from plr.controlplane.core.estimate.processing import ComputeTimes
+from plr.controlplane.core.estimate.witnesses import COUNTS_ANYWAY, MAX_WITNESSES, MOST_ALONE, Witnesses, thinned
+from plr.protos.base.histogram import BUCKETS, MAX_COUNT, Histogram
+from plr.protos.model.ids import NodeName
 from tests.support.samples import PLAN, histogram
 
 if TYPE_CHECKING:

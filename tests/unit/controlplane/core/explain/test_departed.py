@@ -6,16 +6,16 @@ from dataclasses import replace
 
 import pytest
 
-from controlplane.cli.explanation_text import render
-from controlplane.core.control.events import Settings
-from controlplane.core.explain.departed import MAX_DEPARTED, MAX_EXPLAINED, Departed, Departure
-from controlplane.core.explain.explanation import UnknownNameError
-from controlplane.core.policy.policy import CallRule, OfferRule, Policy
-from protos.model.fleet_events import Why
-from protos.model.ids import NodeName, Role
-from protos.model.members import RemovalReason
-from protos.model.report import OutcomeReport, Report
-from protos.model.stream import Drain
+from plr.controlplane.cli.explanation_text import render
+from plr.controlplane.core.control.events import Settings
+from plr.controlplane.core.explain.departed import MAX_DEPARTED, MAX_EXPLAINED, Departed, Departure
+from plr.controlplane.core.explain.explanation import UnknownNameError
+from plr.controlplane.core.policy.policy import CallRule, OfferRule, Policy
+from plr.protos.model.fleet_events import Why
+from plr.protos.model.ids import NodeName, Role
+from plr.protos.model.members import RemovalReason
+from plr.protos.model.report import OutcomeReport, Report
+from plr.protos.model.stream import Drain
 from tests.support.control_world import SETTLED_S, SimSidecar, World
 from tests.support.samples import PLAN, histogram, latency, path
 

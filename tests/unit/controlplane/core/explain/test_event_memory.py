@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import pytest
 
-from controlplane.core.explain.event_memory import EVENTS_BURST, EVENTS_PER_S, MAX_EVENTS, EventMemory
-from protos.model.fleet_events import EventKind, FleetEvent
-from protos.model.ids import NodeName
+from plr.controlplane.core.explain.event_memory import EVENTS_BURST, EVENTS_PER_S, MAX_EVENTS, EventMemory
+from plr.protos.model.fleet_events import EventKind, FleetEvent
+from plr.protos.model.ids import NodeName
 
 pytestmark = pytest.mark.audit("ops-11")
 

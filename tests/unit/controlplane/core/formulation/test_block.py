@@ -7,20 +7,20 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from controlplane.core.estimate.estimator import Estimator
-from controlplane.core.estimate.penalties import LONGEST_S
-from controlplane.core.formulation.block import BlockNotes, Picture
-from controlplane.core.formulation.problem_builder import Drawing
-from controlplane.core.policy.path_rules import PathRule
-from controlplane.core.policy.permits import Permits
-from controlplane.core.policy.policy import CallRule, OfferRule, Policy
-from controlplane.core.problem.objectives import joint_miss
-from controlplane.core.problem.problem import BlockKey, FleetKey, Objective, Target
-from controlplane.core.registry.registry import Sidecar
-from protos.model.ids import InterfaceName, NodeName, Role, ServiceName
-from protos.model.mapping import Assignment
-from protos.model.members import Candidate, Copies, InterfaceLabel, ServiceOffer, ServiceSet, ServiceUse
-from protos.model.report import JointReport, PathReport, PenaltyReport, Report
+from plr.controlplane.core.estimate.estimator import Estimator
+from plr.controlplane.core.estimate.penalties import LONGEST_S
+from plr.controlplane.core.formulation.block import BlockNotes, Picture
+from plr.controlplane.core.formulation.problem_builder import Drawing
+from plr.controlplane.core.policy.path_rules import PathRule
+from plr.controlplane.core.policy.permits import Permits
+from plr.controlplane.core.policy.policy import CallRule, OfferRule, Policy
+from plr.controlplane.core.problem.objectives import joint_miss
+from plr.controlplane.core.problem.problem import BlockKey, FleetKey, Objective, Target
+from plr.controlplane.core.registry.registry import Sidecar
+from plr.protos.model.ids import InterfaceName, NodeName, Role, ServiceName
+from plr.protos.model.mapping import Assignment
+from plr.protos.model.members import Candidate, Copies, InterfaceLabel, ServiceOffer, ServiceSet, ServiceUse
+from plr.protos.model.report import JointReport, PathReport, PenaltyReport, Report
 from tests.support.samples import (
     PLAN,
     candidate,

@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from controlplane.core.estimate.estimator import Estimator
-from controlplane.core.formulation import problem_builder
-from controlplane.core.formulation.block import KEPT_PAIRS
-from controlplane.core.formulation.problem_builder import (
+from plr.controlplane.core.estimate.estimator import Estimator
+from plr.controlplane.core.formulation import problem_builder
+from plr.controlplane.core.formulation.block import KEPT_PAIRS
+from plr.controlplane.core.formulation.problem_builder import (
     EPSILON_SHARE,
     FEW_ROBOTS,
     LIFT_SHARE,
@@ -26,13 +26,13 @@ from controlplane.core.formulation.problem_builder import (
     Drawing,
     is_alike,
 )
-from controlplane.core.policy.permits import Permits
-from controlplane.core.policy.policy import CallRule, OfferRule, Policy
-from controlplane.core.problem.problem import Block, BlockKey, Objective
-from controlplane.core.registry.registry import Sidecar
-from protos.model.ids import InterfaceName, NodeName, Role, ServiceName
-from protos.model.members import InterfaceLabel, ServiceSet
-from protos.model.report import Report
+from plr.controlplane.core.policy.permits import Permits
+from plr.controlplane.core.policy.policy import CallRule, OfferRule, Policy
+from plr.controlplane.core.problem.problem import Block, BlockKey, Objective
+from plr.controlplane.core.registry.registry import Sidecar
+from plr.protos.model.ids import InterfaceName, NodeName, Role, ServiceName
+from plr.protos.model.members import InterfaceLabel, ServiceSet
+from plr.protos.model.report import Report
 from tests.support.samples import PLAN, histogram, interfaces, latency, offer, path, registration, stream, use
 
 if TYPE_CHECKING:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from controlplane.core.overload.admission import Admission
+from plr.controlplane.core.overload.admission import Admission
 
 
 def admission(most_waiting: int = 100, most_on_the_way: int = 2) -> Admission[str]:

@@ -2,9 +2,9 @@ from __future__ import annotations
 
 import pytest
 
-from controlplane.core.base import member_table
-from controlplane.core.overload.line_share import LINES_BURST, LINES_PER_S, LineShare
-from protos.base.token_bucket import TokenBucket
+from plr.controlplane.core.base import member_table
+from plr.controlplane.core.overload.line_share import LINES_BURST, LINES_PER_S, LineShare
+from plr.protos.base.token_bucket import TokenBucket
 
 
 @pytest.mark.audit("ops-16")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from controlplane.core.overload.pacing import GROWTH, MAX_INTERVAL_S, REPORTS_PER_LEASE, WORTH_TELLING, Pacing
+from plr.controlplane.core.overload.pacing import GROWTH, MAX_INTERVAL_S, REPORTS_PER_LEASE, WORTH_TELLING, Pacing
 
 pytestmark = pytest.mark.audit("ops-18")
 

@@ -6,16 +6,16 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from controlplane.core.base import member_table
-from controlplane.core.overload.registration_share import RETURN_COST, STARTS_BURST, STARTS_PER_S, RegistrationShare
-from controlplane.core.registry.registry import Admission, Refusal, Registry
-from protos.model.ids import NodeName, Role
+from plr.controlplane.core.base import member_table
+from plr.controlplane.core.overload.registration_share import RETURN_COST, STARTS_BURST, STARTS_PER_S, RegistrationShare
+from plr.controlplane.core.registry.registry import Admission, Refusal, Registry
+from plr.protos.model.ids import NodeName, Role
 from tests.support.samples import registration, stream
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from protos.model.members import Registration
+    from plr.protos.model.members import Registration
 
 pytestmark = pytest.mark.audit("ops-16")
 

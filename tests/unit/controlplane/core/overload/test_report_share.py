@@ -7,8 +7,8 @@ from dataclasses import dataclass, field
 
 import pytest
 
-from controlplane.core.base import member_table
-from controlplane.core.overload.report_share import (
+from plr.controlplane.core.base import member_table
+from plr.controlplane.core.overload.report_share import (
     BUSY,
     ENTRIES_BURST,
     ENTRIES_PER_S,
@@ -17,9 +17,9 @@ from controlplane.core.overload.report_share import (
     ReportShares,
     level,
 )
-from protos.convert.fields import MAX_OUTCOMES
-from protos.model.ids import NodeName
-from protos.model.report import MAX_GOODBYES, MAX_JOINTS, MAX_LATENCIES, MAX_PATHS, MAX_PENALTIES
+from plr.protos.convert.fields import MAX_OUTCOMES
+from plr.protos.model.ids import NodeName
+from plr.protos.model.report import MAX_GOODBYES, MAX_JOINTS, MAX_LATENCIES, MAX_PATHS, MAX_PENALTIES
 
 ROBOT = NodeName("robot")
 ENTRY_S = 40e-6

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import pytest
 
-from controlplane.core.base import member_table
-from controlplane.core.overload.urgency import LEAST_PAIRS, PAIRS_BURST, PAIRS_PER_S, Urgency
-from protos.model.ids import NodeName
+from plr.controlplane.core.base import member_table
+from plr.controlplane.core.overload.urgency import LEAST_PAIRS, PAIRS_BURST, PAIRS_PER_S, Urgency
+from plr.protos.model.ids import NodeName
 
 ROBOT, OTHER = NodeName("robot"), NodeName("other")
 

@@ -6,9 +6,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from controlplane.core.policy.patterns import NameKind, can_match, matches
-from protos.base.errors import DecodeError
-from protos.model.names import interface_name, node_name, service_name
+from plr.controlplane.core.policy.patterns import NameKind, can_match, matches
+from plr.protos.base.errors import DecodeError
+from plr.protos.model.names import interface_name, node_name, service_name
 
 CHECKS = {NameKind.NODE: node_name, NameKind.SERVICE: service_name, NameKind.INTERFACE: interface_name}
 NAMES = {

@@ -5,7 +5,7 @@ from __future__ import annotations
 from hypothesis import given
 from hypothesis import strategies as st
 
-from controlplane.core.policy.patterns import PatternIndex, matches
+from plr.controlplane.core.policy.patterns import PatternIndex, matches
 
 _NAMES = st.text("ab1", min_size=1, max_size=4)
 _PATTERNS = st.text("ab1*?[!]", min_size=1, max_size=5)

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from controlplane.core.policy.explain import MAX_CLOSE, explain
-from controlplane.core.policy.policy import CallRule, OfferRule, Policy
-from protos.model.ids import NodeName, ServiceName
-from protos.model.members import NO_POLICY, POLICY_PENDING
+from plr.controlplane.core.policy.explain import MAX_CLOSE, explain
+from plr.controlplane.core.policy.policy import CallRule, OfferRule, Policy
+from plr.protos.model.ids import NodeName, ServiceName
+from plr.protos.model.members import NO_POLICY, POLICY_PENDING
 
 ARM, BASE = NodeName("arm-1"), NodeName("base-1")
 A, B = NodeName("cloud-a"), NodeName("cloud-b")

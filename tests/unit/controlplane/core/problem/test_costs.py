@@ -7,11 +7,11 @@ import random
 import numpy as np
 import pytest
 
-from controlplane.core.problem.costs import block_cost, choice_costs, without_rules
-from controlplane.core.problem.plan import make_plan
-from controlplane.core.problem.problem import Block, Choice, Objective, Problem, Target
-from controlplane.solver.matcher import solve
-from protos.model.members import AT_MOST_EVERY_INTERFACE, Copies
+from plr.controlplane.core.problem.costs import block_cost, choice_costs, without_rules
+from plr.controlplane.core.problem.plan import make_plan
+from plr.controlplane.core.problem.problem import Block, Choice, Objective, Problem, Target
+from plr.controlplane.solver.matcher import solve
+from plr.protos.model.members import AT_MOST_EVERY_INTERFACE, Copies
 from tests.unit.controlplane.problems import block, plain_cost, random_problem, rank, valid_choices
 
 EVEN = ((1.0, 1.0), (1.0, 1.0))

@@ -8,9 +8,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from controlplane.core.estimate.late_fate import LateFate
-from controlplane.core.estimate.posterior import USUAL_STREAK
-from controlplane.core.problem.mode_miss import (
+from plr.controlplane.core.estimate.late_fate import LateFate
+from plr.controlplane.core.estimate.posterior import USUAL_STREAK
+from plr.controlplane.core.problem.mode_miss import (
     DELAYS,
     TOGETHER,
     TOGETHER_MISSES,
@@ -20,10 +20,10 @@ from controlplane.core.problem.mode_miss import (
     miss_of,
     pair_timing,
 )
-from controlplane.core.problem.objectives import joint_miss
-from controlplane.core.problem.problem import Block, BlockKey
-from protos.model.ids import InterfaceName, NodeName
-from protos.model.redundancy_mode import RedundancyMode
+from plr.controlplane.core.problem.objectives import joint_miss
+from plr.controlplane.core.problem.problem import Block, BlockKey
+from plr.protos.model.ids import InterfaceName, NodeName
+from plr.protos.model.redundancy_mode import RedundancyMode
 from tests.support.samples import PLAN, use
 
 pytestmark = pytest.mark.audit("ops-12")

@@ -8,8 +8,8 @@ import random
 import numpy as np
 import pytest
 
-from controlplane.core.problem.objectives import joint_miss, objective_cost, objective_costs
-from controlplane.core.problem.problem import Objective
+from plr.controlplane.core.problem.objectives import joint_miss, objective_cost, objective_costs
+from plr.controlplane.core.problem.problem import Objective
 from tests.unit.controlplane.problems import block, plain_objective, random_problem, valid_choices
 
 TOGETHER = ((0, 0), (1, 1))

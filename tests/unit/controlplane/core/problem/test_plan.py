@@ -6,9 +6,9 @@ import math
 
 import pytest
 
-from controlplane.core.problem.costs import RULE_PRICE
-from controlplane.core.problem.plan import Plan, Price, choice_of, make_plan, price, relative_gap, size
-from controlplane.core.problem.problem import Objective, Problem
+from plr.controlplane.core.problem.costs import RULE_PRICE
+from plr.controlplane.core.problem.plan import Plan, Price, choice_of, make_plan, price, relative_gap, size
+from plr.controlplane.core.problem.problem import Objective, Problem
 from tests.unit.controlplane.problems import block
 
 

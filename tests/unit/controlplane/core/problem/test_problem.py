@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from controlplane.core.problem.problem import FleetKey, Problem, fleet_excess, is_valid
-from protos.model.ids import NodeName
+from plr.controlplane.core.problem.problem import FleetKey, Problem, fleet_excess, is_valid
+from plr.protos.model.ids import NodeName
 from tests.unit.controlplane.problems import PLAN, block
 
 CLOUD_0 = FleetKey(NodeName("cloud-0"), PLAN)

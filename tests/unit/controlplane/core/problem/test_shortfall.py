@@ -8,11 +8,11 @@ from dataclasses import replace
 
 import pytest
 
-from controlplane.core.problem.objectives import PROBABILITY_FLOOR, joint_miss
-from controlplane.core.problem.problem import Objective, Target
-from controlplane.core.problem.shortfall import shortfall
-from protos.model.ids import InterfaceName, NodeName
-from protos.model.members import Copies
+from plr.controlplane.core.problem.objectives import PROBABILITY_FLOOR, joint_miss
+from plr.controlplane.core.problem.problem import Objective, Target
+from plr.controlplane.core.problem.shortfall import shortfall
+from plr.protos.model.ids import InterfaceName, NodeName
+from plr.protos.model.members import Copies
 from tests.unit.controlplane.problems import block, random_problem, valid_choices
 
 

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from controlplane.core.problem.problem import BlockKey
-from controlplane.core.publish import history as mapping_history
-from controlplane.core.publish.history import MAX_CHANGES, MappingHistory
-from protos.model.ids import InterfaceName, NodeName, Version
-from protos.model.mapping import Assignment, MappingSet, ServiceMapping
+from plr.controlplane.core.problem.problem import BlockKey
+from plr.controlplane.core.publish import history as mapping_history
+from plr.controlplane.core.publish.history import MAX_CHANGES, MappingHistory
+from plr.protos.model.ids import InterfaceName, NodeName, Version
+from plr.protos.model.mapping import Assignment, MappingSet, ServiceMapping
 from tests.support.samples import PLAN
 
 if TYPE_CHECKING:

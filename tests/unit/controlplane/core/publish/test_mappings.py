@@ -6,14 +6,14 @@ from dataclasses import replace
 
 import pytest
 
-from controlplane.core.formulation.block import BlockNotes, Picture
-from controlplane.core.problem.plan import BlockPlan, Plan
-from controlplane.core.problem.problem import BlockKey, FleetKey, Problem
-from controlplane.core.publish.mappings import differs, mapping_of, reads_differently
-from controlplane.core.registry.registry import Sidecar
-from protos.model.ids import InterfaceName, NodeName, ServiceName
-from protos.model.mapping import Assignment, ServiceMapping
-from protos.model.members import ALL_CALLS, CallPermit, Copies, ServiceSet, ServiceUse
+from plr.controlplane.core.formulation.block import BlockNotes, Picture
+from plr.controlplane.core.problem.plan import BlockPlan, Plan
+from plr.controlplane.core.problem.problem import BlockKey, FleetKey, Problem
+from plr.controlplane.core.publish.mappings import differs, mapping_of, reads_differently
+from plr.controlplane.core.registry.registry import Sidecar
+from plr.protos.model.ids import InterfaceName, NodeName, ServiceName
+from plr.protos.model.mapping import Assignment, ServiceMapping
+from plr.protos.model.members import ALL_CALLS, CallPermit, Copies, ServiceSet, ServiceUse
 from tests.support.samples import PLAN, interfaces, registration, stream, use
 
 KEY = BlockKey(NodeName("robot"), PLAN)

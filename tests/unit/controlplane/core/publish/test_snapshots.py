@@ -6,12 +6,12 @@ from typing import Any
 
 import pytest
 
-from controlplane.core.publish.snapshots import MAX_LIFTED, PeerView, Snapshots, Track, VersionSource
-from controlplane.core.publish.told_peers import ToldPeers
-from protos.model.ids import MAX_VERSION, NodeName, Role, SessionId, Version
-from protos.model.members import Peer
-from protos.model.status import SyncState
-from protos.model.stream import Ack, Nack, ResourceKind
+from plr.controlplane.core.publish.snapshots import MAX_LIFTED, PeerView, Snapshots, Track, VersionSource
+from plr.controlplane.core.publish.told_peers import ToldPeers
+from plr.protos.model.ids import MAX_VERSION, NodeName, Role, SessionId, Version
+from plr.protos.model.members import Peer
+from plr.protos.model.status import SyncState
+from plr.protos.model.stream import Ack, Nack, ResourceKind
 
 EPOCH = 1000
 

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from dataclasses import fields, replace
 
-from controlplane.core.publish.told_peers import ToldPeers
-from protos.model.ids import NodeName, Role, SessionId
-from protos.model.members import ALL_CALLS, Peer
-from protos.trust.pair_token import pair_token
+from plr.controlplane.core.publish.told_peers import ToldPeers
+from plr.protos.model.ids import NodeName, Role, SessionId
+from plr.protos.model.members import ALL_CALLS, Peer
+from plr.protos.trust.pair_token import pair_token
 from tests.support.samples import interfaces, offer
 
 ROBOT = NodeName("robot")

@@ -6,12 +6,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from controlplane.core.policy.permits import Permits
-from controlplane.core.policy.policy import CallRule, OfferRule, Policy
-from controlplane.core.publish.views import KnownPeers, Views
-from controlplane.core.registry.registry import Registry, Sidecar
-from protos.model.ids import NodeName, Role, ServiceName
-from protos.model.members import ALL_CALLS, CallPermit, CandidateSet, RemovalReason, RemovedPeer, ServiceSet
+from plr.controlplane.core.policy.permits import Permits
+from plr.controlplane.core.policy.policy import CallRule, OfferRule, Policy
+from plr.controlplane.core.publish.views import KnownPeers, Views
+from plr.controlplane.core.registry.registry import Registry, Sidecar
+from plr.protos.model.ids import NodeName, Role, ServiceName
+from plr.protos.model.members import ALL_CALLS, CallPermit, CandidateSet, RemovalReason, RemovedPeer, ServiceSet
 from tests.support.samples import interfaces, offer, registration, stream
 from tests.unit.controlplane.policies import CLOUDS, ROBOTS, SERVICES, policies
 

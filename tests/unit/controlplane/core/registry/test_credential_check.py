@@ -7,16 +7,16 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from controlplane.ca import Authority, Issued
-from controlplane.core.registry.credential_check import check_claims, check_unproven_claims
-from controlplane.core.registry.registry import Refusal
-from protos.model.ids import NodeName, Role
-from protos.trust.credential import Aead, SessionCredential, session_number
-from protos.trust.identity import Identity, IdentityRole, Trust
+from plr.controlplane.ca import Authority, Issued
+from plr.controlplane.core.registry.credential_check import check_claims, check_unproven_claims
+from plr.controlplane.core.registry.registry import Refusal
+from plr.protos.model.ids import NodeName, Role
+from plr.protos.trust.credential import Aead, SessionCredential, session_number
+from plr.protos.trust.identity import Identity, IdentityRole, Trust
 from tests.support.samples import registration as sample
 
 if TYPE_CHECKING:
-    from protos.model.members import Registration
+    from plr.protos.model.members import Registration
 
 
 @pytest.fixture(scope="module")

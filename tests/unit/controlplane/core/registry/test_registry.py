@@ -6,11 +6,11 @@ from dataclasses import replace
 
 import pytest
 
-from controlplane.core.overload.postponed import COUNTED_BURST
-from controlplane.core.registry import registry as registry_module
-from controlplane.core.registry.registry import MAX_POSTPONED, POSTPONE_S, Admission, Refusal, Registry
-from protos.model.ids import NodeName, Role
-from protos.model.members import CandidateSet, RemovalReason, ServiceSet
+from plr.controlplane.core.overload.postponed import COUNTED_BURST
+from plr.controlplane.core.registry import registry as registry_module
+from plr.controlplane.core.registry.registry import MAX_POSTPONED, POSTPONE_S, Admission, Refusal, Registry
+from plr.protos.model.ids import NodeName, Role
+from plr.protos.model.members import CandidateSet, RemovalReason, ServiceSet
 from tests.support.samples import interfaces, offer, registration, stream
 
 ROBOT = NodeName("robot")

@@ -8,8 +8,8 @@ import pytest
 from scipy.integrate import quad
 from scipy.stats import beta
 
-from controlplane.core.problem.problem import Block, Objective
-from controlplane.core.settle.certainty import probability_better
+from plr.controlplane.core.problem.problem import Block, Objective
+from plr.controlplane.core.settle.certainty import probability_better
 from tests.unit.controlplane.problems import block
 
 

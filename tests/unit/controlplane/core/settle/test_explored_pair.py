@@ -8,11 +8,11 @@ from statistics import fmean
 
 import pytest
 
-from controlplane.core.problem.plan import BlockPlan, Plan, make_plan
-from controlplane.core.problem.problem import Block, Choice, Problem
-from controlplane.core.settle.explored_pair import TRIALS, Exploration, knowledge_gradient, most_instructive
-from protos.model.ids import InterfaceName, NodeName
-from protos.model.mapping import Assignment
+from plr.controlplane.core.problem.plan import BlockPlan, Plan, make_plan
+from plr.controlplane.core.problem.problem import Block, Choice, Problem
+from plr.controlplane.core.settle.explored_pair import TRIALS, Exploration, knowledge_gradient, most_instructive
+from plr.protos.model.ids import InterfaceName, NodeName
+from plr.protos.model.mapping import Assignment
 from tests.unit.controlplane.problems import block
 
 

@@ -7,12 +7,12 @@ from dataclasses import replace
 
 import pytest
 
-from controlplane.core.problem.plan import Plan, make_plan, price
-from controlplane.core.problem.problem import FleetKey, Objective, Problem, Target
-from controlplane.core.settle.stability import CHANGE_WINDOW_S, MAX_CHANGES, Stability
-from controlplane.solver.matcher import solve
-from protos.model.ids import NodeName
-from protos.model.members import AT_MOST_EVERY_INTERFACE
+from plr.controlplane.core.problem.plan import Plan, make_plan, price
+from plr.controlplane.core.problem.problem import FleetKey, Objective, Problem, Target
+from plr.controlplane.core.settle.stability import CHANGE_WINDOW_S, MAX_CHANGES, Stability
+from plr.controlplane.solver.matcher import solve
+from plr.protos.model.ids import NodeName
+from plr.protos.model.members import AT_MOST_EVERY_INTERFACE
 from tests.unit.controlplane.problems import PLAN, block, choices_of, random_problem
 
 

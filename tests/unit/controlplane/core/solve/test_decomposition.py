@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 from ortools.graph.python import min_cost_flow
 
-from controlplane.core.problem.objectives import path_costs
-from controlplane.core.problem.plan import price
-from controlplane.core.problem.problem import Block, FleetKey, Objective, Problem, block_excess, is_valid
-from controlplane.core.solve.batch import EnumeratedStack
-from controlplane.core.solve.decomposition import Decomposition, stack_blocks
-from controlplane.core.solve.enumeration import OWN_EXCESS_PRICE
-from controlplane.core.solve.limits import Limits
+from plr.controlplane.core.problem.objectives import path_costs
+from plr.controlplane.core.problem.plan import price
+from plr.controlplane.core.problem.problem import Block, FleetKey, Objective, Problem, block_excess, is_valid
+from plr.controlplane.core.solve.batch import EnumeratedStack
+from plr.controlplane.core.solve.decomposition import Decomposition, stack_blocks
+from plr.controlplane.core.solve.enumeration import OWN_EXCESS_PRICE
+from plr.controlplane.core.solve.limits import Limits
 from tests.unit.controlplane.problems import PLAN, best_price, block, fleet, plain_cost, random_problem, valid_choices
 
 FLOW_UNIT = 1e-6

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import pytest
 
-from controlplane.core.problem.problem import Block, BlockKey, FleetKey, Objective, Problem
-from controlplane.core.solve.decomposition import stack_blocks
-from controlplane.core.solve.exchange import trade
-from controlplane.core.solve.incumbent import Standing
-from controlplane.core.solve.limits import Limits
-from protos.model.ids import InterfaceName, NodeName
+from plr.controlplane.core.problem.problem import Block, BlockKey, FleetKey, Objective, Problem
+from plr.controlplane.core.solve.decomposition import stack_blocks
+from plr.controlplane.core.solve.exchange import trade
+from plr.controlplane.core.solve.incumbent import Standing
+from plr.controlplane.core.solve.limits import Limits
+from plr.protos.model.ids import InterfaceName, NodeName
 from tests.support.samples import PLAN
 
 SERVERS = tuple(NodeName(name) for name in "abc")

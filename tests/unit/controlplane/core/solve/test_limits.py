@@ -6,9 +6,9 @@ import random
 
 import pytest
 
-from controlplane.core.problem.problem import FleetKey, Problem
-from controlplane.core.solve.limits import independent_groups
-from protos.model.ids import NodeName
+from plr.controlplane.core.problem.problem import FleetKey, Problem
+from plr.controlplane.core.solve.limits import independent_groups
+from plr.protos.model.ids import NodeName
 from tests.unit.controlplane.problems import PLAN, best_price, block, random_problem
 
 CLOUD_0 = FleetKey(NodeName("cloud-0"), PLAN)

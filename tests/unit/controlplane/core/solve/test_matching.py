@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.optimize import linear_sum_assignment
 
-from controlplane.core.solve.matching import cheapest_columns, cheapest_matching
+from plr.controlplane.core.solve.matching import cheapest_columns, cheapest_matching
 
 
 @pytest.mark.parametrize("seed", range(5))

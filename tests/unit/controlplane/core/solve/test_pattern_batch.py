@@ -10,17 +10,17 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pytest
 
-from controlplane.core.problem.problem import Block, Objective, Problem, block_excess, is_valid
-from controlplane.core.solve.enumeration import OWN_EXCESS_PRICE
-from controlplane.core.solve.limits import Limits
-from controlplane.core.solve.pattern_batch import PatternStack
-from protos.model.members import Copies
+from plr.controlplane.core.problem.problem import Block, Objective, Problem, block_excess, is_valid
+from plr.controlplane.core.solve.enumeration import OWN_EXCESS_PRICE
+from plr.controlplane.core.solve.limits import Limits
+from plr.controlplane.core.solve.pattern_batch import PatternStack
+from plr.protos.model.members import Copies
 from tests.unit.controlplane.problems import block, plain_cost, random_problem, valid_choices
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from controlplane.core.problem.problem import Choice
+    from plr.controlplane.core.problem.problem import Choice
 
 
 def random_stacks(rng: random.Random, objective: Objective) -> Iterator[list[Block]]:

@@ -6,9 +6,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from controlplane.core.stun.responder import StunOutcome, StunResponder
-from controlplane.core.stun.source_limits import ANSWERS_BURST, ANSWERS_PER_S
-from protos.stun.codec import MessageClass, StunMessage, decode, encode
+from plr.controlplane.core.stun.responder import StunOutcome, StunResponder
+from plr.controlplane.core.stun.source_limits import ANSWERS_BURST, ANSWERS_PER_S
+from plr.protos.stun.codec import MessageClass, StunMessage, decode, encode
 
 TRANSACTION_ID = bytes(range(12))
 SOURCE = ("198.51.100.7", 40000)

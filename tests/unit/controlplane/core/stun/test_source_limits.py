@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from controlplane.core.stun.source_limits import (
+from plr.controlplane.core.stun.source_limits import (
     ANSWERS_BURST,
     ANSWERS_PER_S,
     MAX_SOURCES,

@@ -2,8 +2,8 @@ from __future__ import annotations
 
 import pytest
 
-from protos.model.ids import NodeName
-from sidecar.core.base.fair_share import Shares
+from plr.protos.model.ids import NodeName
+from plr.sidecar.core.base.fair_share import Shares
 from tests.support.builders import A, B
 
 

@@ -2,8 +2,8 @@ from __future__ import annotations
 
 import itertools
 
-from protos.model.ids import SessionId
-from sidecar.core.base.request_id import REQUEST_ID_BYTES, make_request_id
+from plr.protos.model.ids import SessionId
+from plr.sidecar.core.base.request_id import REQUEST_ID_BYTES, make_request_id
 
 
 def test_every_part_of_the_identity_counts() -> None:

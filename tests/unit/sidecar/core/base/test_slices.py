@@ -6,8 +6,8 @@ from functools import partial
 
 import pytest
 
-from sidecar.core.base.slices import SLICE, Backlog
-from sidecar.core.seam.application import RequestFailed
+from plr.sidecar.core.base.slices import SLICE, Backlog
+from plr.sidecar.core.seam.application import RequestFailed
 from tests.support.mesh import Mesh, rule
 
 pytestmark = pytest.mark.audit("dp-10")

@@ -6,7 +6,7 @@ import random
 
 import pytest
 
-from sidecar.core.base.timers import SKIPPED_AT_ONCE, SLACK, Timers, first_of
+from plr.sidecar.core.base.timers import SKIPPED_AT_ONCE, SLACK, Timers, first_of
 
 
 def test_the_earliest_comes_first_and_a_new_time_replaces_the_old() -> None:

@@ -6,25 +6,25 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from protos.model.ids import NodeName
-from sidecar.core.base.slices import SLICE, Backlog
-from sidecar.core.base.values import PathState, Priority, RejectReason
-from sidecar.core.cloud import answers as answers_module
-from sidecar.core.cloud.answers import Answers
-from sidecar.core.cloud.executions import Reply, Waiter
-from sidecar.core.rules.service_rule import Rules
-from sidecar.core.seam.links import LinkCommand, Send
-from sidecar.core.seam.stats import EngineStats
-from sidecar.core.transfer.outbox import Outbox
-from sidecar.core.transfer.room import SMALL_ROOM_BYTES
-from sidecar.core.transfer.routes import Routes
-from sidecar.core.wire.messages import RejectionMessage, ResponseMessage, decode_message
+from plr.protos.model.ids import NodeName
+from plr.sidecar.core.base.slices import SLICE, Backlog
+from plr.sidecar.core.base.values import PathState, Priority, RejectReason
+from plr.sidecar.core.cloud import answers as answers_module
+from plr.sidecar.core.cloud.answers import Answers
+from plr.sidecar.core.cloud.executions import Reply, Waiter
+from plr.sidecar.core.rules.service_rule import Rules
+from plr.sidecar.core.seam.links import LinkCommand, Send
+from plr.sidecar.core.seam.stats import EngineStats
+from plr.sidecar.core.transfer.outbox import Outbox
+from plr.sidecar.core.transfer.room import SMALL_ROOM_BYTES
+from plr.sidecar.core.transfer.routes import Routes
+from plr.sidecar.core.wire.messages import RejectionMessage, ResponseMessage, decode_message
 from tests.support.builders import ECHO, path, request_id, rule
 
 if TYPE_CHECKING:
-    from sidecar.core.base.values import PathId
-    from sidecar.core.message.outbound import OutboundMessage
-    from sidecar.core.wire.messages import Message
+    from plr.sidecar.core.base.values import PathId
+    from plr.sidecar.core.message.outbound import OutboundMessage
+    from plr.sidecar.core.wire.messages import Message
 
 pytestmark = pytest.mark.audit("dp-1")
 ROBOT = NodeName("robot")

@@ -2,10 +2,10 @@ from __future__ import annotations
 
 import pytest
 
-from protos.model.ids import NodeName
-from sidecar.core.base.fair_share import FORGOTTEN_AT_ONCE
-from sidecar.core.cloud.early_cancels import MAX_EARLY_CANCELS, REMEMBER_CANCEL_S, EarlyCancels
-from sidecar.core.seam.stats import EngineStats
+from plr.protos.model.ids import NodeName
+from plr.sidecar.core.base.fair_share import FORGOTTEN_AT_ONCE
+from plr.sidecar.core.cloud.early_cancels import MAX_EARLY_CANCELS, REMEMBER_CANCEL_S, EarlyCancels
+from plr.sidecar.core.seam.stats import EngineStats
 from tests.support.builders import request_id
 
 ROBOT, OTHER = NodeName("robot"), NodeName("other")

@@ -4,12 +4,12 @@ from itertools import pairwise
 
 import pytest
 
-from protos.model.ids import NodeName, ServiceName
-from sidecar.core.base.fair_share import FORGOTTEN_AT_ONCE
-from sidecar.core.base.slices import Backlog
-from sidecar.core.base.values import ExecutionId, RejectReason
-from sidecar.core.cloud import executions as dedup
-from sidecar.core.cloud.executions import (
+from plr.protos.model.ids import NodeName, ServiceName
+from plr.sidecar.core.base.fair_share import FORGOTTEN_AT_ONCE
+from plr.sidecar.core.base.slices import Backlog
+from plr.sidecar.core.base.values import ExecutionId, RejectReason
+from plr.sidecar.core.cloud import executions as dedup
+from plr.sidecar.core.cloud.executions import (
     MAX_CACHED_BYTES,
     MAX_RUNNING,
     MAX_WAITERS,
@@ -20,10 +20,10 @@ from sidecar.core.cloud.executions import (
     Reply,
     Waiter,
 )
-from sidecar.core.rules.service_rule import MAX_LIFETIME_S
-from sidecar.core.seam.application import AbandonExecution, CancelExecution, ExecuteRequest
-from sidecar.core.seam.stats import EngineStats
-from sidecar.core.wire.messages import MAX_PAYLOAD_BYTES, RejectionMessage, RequestMessage, ResponseMessage
+from plr.sidecar.core.rules.service_rule import MAX_LIFETIME_S
+from plr.sidecar.core.seam.application import AbandonExecution, CancelExecution, ExecuteRequest
+from plr.sidecar.core.seam.stats import EngineStats
+from plr.sidecar.core.wire.messages import MAX_PAYLOAD_BYTES, RejectionMessage, RequestMessage, ResponseMessage
 from tests.support.builders import ECHO, path, request
 
 ROBOT = path(peer="robot")

@@ -2,23 +2,23 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from protos.model.ids import NodeName, ServiceName
-from protos.model.members import ServiceOffer
-from sidecar.core.base.slices import Backlog
-from sidecar.core.base.values import PathState, RejectReason
-from sidecar.core.cloud.forbidden_calls import MAX_ROBOTS, TELL_EVERY_S, ForbiddenCalls
-from sidecar.core.cloud.serving import Serving, ServingParts
-from sidecar.core.rules.service_rule import Rules
-from sidecar.core.seam.application import ApplicationEvent, CallsForbidden, ExecuteRequest
-from sidecar.core.seam.links import PathCommand, Send
-from sidecar.core.seam.stats import EngineStats
-from sidecar.core.transfer.outbox import Outbox
-from sidecar.core.transfer.routes import Routes
-from sidecar.core.wire.messages import RejectionMessage, ResponseMessage, decode_message
+from plr.protos.model.ids import NodeName, ServiceName
+from plr.protos.model.members import ServiceOffer
+from plr.sidecar.core.base.slices import Backlog
+from plr.sidecar.core.base.values import PathState, RejectReason
+from plr.sidecar.core.cloud.forbidden_calls import MAX_ROBOTS, TELL_EVERY_S, ForbiddenCalls
+from plr.sidecar.core.cloud.serving import Serving, ServingParts
+from plr.sidecar.core.rules.service_rule import Rules
+from plr.sidecar.core.seam.application import ApplicationEvent, CallsForbidden, ExecuteRequest
+from plr.sidecar.core.seam.links import PathCommand, Send
+from plr.sidecar.core.seam.stats import EngineStats
+from plr.sidecar.core.transfer.outbox import Outbox
+from plr.sidecar.core.transfer.routes import Routes
+from plr.sidecar.core.wire.messages import RejectionMessage, ResponseMessage, decode_message
 from tests.support.builders import ECHO, TYPE, WLAN, path, request, rule
 
 if TYPE_CHECKING:
-    from sidecar.core.wire.messages import Message
+    from plr.sidecar.core.wire.messages import Message
 
 ROBOT, OTHER = NodeName("robot"), NodeName("robot-2")
 SECRET = ServiceName("/secret")

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import pytest
 
-from protos.model.ids import NodeName
-from sidecar.core.base.values import RejectReason
-from sidecar.core.cloud import refused_copies
-from sidecar.core.cloud.executions import MIN_REMEMBER_S, Reply, Waiter
-from sidecar.core.cloud.refused_copies import RefusedCopies, RefusedCopy
-from sidecar.core.seam.stats import EngineStats
-from sidecar.core.wire.messages import RejectionMessage
+from plr.protos.model.ids import NodeName
+from plr.sidecar.core.base.values import RejectReason
+from plr.sidecar.core.cloud import refused_copies
+from plr.sidecar.core.cloud.executions import MIN_REMEMBER_S, Reply, Waiter
+from plr.sidecar.core.cloud.refused_copies import RefusedCopies, RefusedCopy
+from plr.sidecar.core.seam.stats import EngineStats
+from plr.sidecar.core.wire.messages import RejectionMessage
 from tests.support.builders import request, request_id
 from tests.unit.sidecar.core.cloud.test_executions import ROBOT, ROBOT_2ND, run, table
 

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import pytest
 
-from protos.model.ids import NodeName
-from sidecar.core.base.fair_share import FORGOTTEN_AT_ONCE
-from sidecar.core.base.values import RejectReason, RequestId
-from sidecar.core.cloud.refused_copies import RefusedCopies, RefusedCopy
-from sidecar.core.seam.stats import EngineStats
+from plr.protos.model.ids import NodeName
+from plr.sidecar.core.base.fair_share import FORGOTTEN_AT_ONCE
+from plr.sidecar.core.base.values import RejectReason, RequestId
+from plr.sidecar.core.cloud.refused_copies import RefusedCopies, RefusedCopy
+from plr.sidecar.core.seam.stats import EngineStats
 
 ROBOT = NodeName("robot")
 

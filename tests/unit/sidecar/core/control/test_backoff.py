@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import random
 
-from sidecar.core.control.backoff import Backoff
+from plr.sidecar.core.control.backoff import Backoff
 
 
 class TopOfRange(random.Random):

@@ -7,9 +7,9 @@ from typing import Any
 
 import pytest
 
-from protos.model.ids import NodeName, Role, SessionId, Version
-from protos.model.members import MAX_PEERS, Peer, PeerSet, RemovalReason, RemovedPeer
-from sidecar.core.control.peer_assembly import PeerAssembly
+from plr.protos.model.ids import NodeName, Role, SessionId, Version
+from plr.protos.model.members import MAX_PEERS, Peer, PeerSet, RemovalReason, RemovedPeer
+from plr.sidecar.core.control.peer_assembly import PeerAssembly
 
 SEEDS = range(200)
 

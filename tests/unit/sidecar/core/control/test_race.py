@@ -2,9 +2,9 @@ from __future__ import annotations
 
 import pytest
 
-from protos.model.ids import InterfaceName
-from sidecar.core.control.race import ControlRace
-from sidecar.core.control.ways import STAGGER_S, Way, WayClass
+from plr.protos.model.ids import InterfaceName
+from plr.sidecar.core.control.race import ControlRace
+from plr.sidecar.core.control.ways import STAGGER_S, Way, WayClass
 
 A, B, C, D = (Way(InterfaceName(f"if{n}"), ("192.0.2.1", 1)) for n in range(4))
 

@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from protos.base.histogram import Histogram
-from protos.model.ids import (
+from plr.protos.base.histogram import Histogram
+from plr.protos.model.ids import (
     MAX_VERSION,
     PROTOCOL_VERSION,
     InterfaceId,
@@ -21,12 +21,20 @@ from protos.model.ids import (
     SessionId,
     Version,
 )
-from protos.model.mapping import MappingSet
-from protos.model.members import Candidate, CandidateKind, CandidateSet, PeerSet, Registration, ServiceOffer, ServiceSet
-from protos.model.report import OutcomeReport, PathReport, Report
-from protos.model.stream import Ack, Drain, Heartbeat, Nack, ResourceKind, SidecarMessage, Welcome
-from sidecar.core.base.report_scope import ReportScope
-from sidecar.core.control.session import (
+from plr.protos.model.mapping import MappingSet
+from plr.protos.model.members import (
+    Candidate,
+    CandidateKind,
+    CandidateSet,
+    PeerSet,
+    Registration,
+    ServiceOffer,
+    ServiceSet,
+)
+from plr.protos.model.report import OutcomeReport, PathReport, Report
+from plr.protos.model.stream import Ack, Drain, Heartbeat, Nack, ResourceKind, SidecarMessage, Welcome
+from plr.sidecar.core.base.report_scope import ReportScope
+from plr.sidecar.core.control.session import (
     MIN_INTERVAL_S,
     PATIENCE_TIMES,
     RETRY_FIRST_S,

@@ -4,9 +4,9 @@ from collections import Counter
 
 import pytest
 
-from protos.model.ids import InterfaceName
-from sidecar.core.base.values import PathState
-from sidecar.core.control.watch import (
+from plr.protos.model.ids import InterfaceName
+from plr.sidecar.core.base.values import PathState
+from plr.sidecar.core.control.watch import (
     CHEAPER,
     CONFIRMED_S,
     DOUBT_S,
@@ -20,7 +20,7 @@ from sidecar.core.control.watch import (
     ControlWatch,
     Seen,
 )
-from sidecar.core.control.ways import WELL_S, ControlInterface, ControlWays, Price, Way
+from plr.sidecar.core.control.ways import WELL_S, ControlInterface, ControlWays, Price, Way
 
 WLAN, WWAN = InterfaceName("wlan0"), InterfaceName("wwan0")
 OVER_WLAN, OVER_WWAN = Way(WLAN, ("192.0.2.1", 1)), Way(WWAN, ("192.0.2.1", 1))

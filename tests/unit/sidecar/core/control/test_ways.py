@@ -4,9 +4,9 @@ from collections import Counter
 
 import pytest
 
-from protos.model.ids import Address, InterfaceName
-from sidecar.core.base.values import PathState
-from sidecar.core.control.ways import (
+from plr.protos.model.ids import Address, InterfaceName
+from plr.sidecar.core.base.values import PathState
+from plr.sidecar.core.control.ways import (
     ADDRESSES_FULL,
     FAILED_FIRST_S,
     FAILED_MAX_S,

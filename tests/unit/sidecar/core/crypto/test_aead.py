@@ -3,8 +3,8 @@ from __future__ import annotations
 import pytest
 from cryptography.exceptions import InvalidTag
 
-from protos.trust.credential import Aead
-from sidecar.core.crypto.aead import KEY_BYTES, NONCE_BYTES, TAG_BYTES, choose, make_cipher
+from plr.protos.trust.credential import Aead
+from plr.sidecar.core.crypto.aead import KEY_BYTES, NONCE_BYTES, TAG_BYTES, choose, make_cipher
 
 KEY, NONCE, CLEAR = bytes(range(KEY_BYTES)), bytes(range(NONCE_BYTES)), b"clear"
 GOLDENS = {

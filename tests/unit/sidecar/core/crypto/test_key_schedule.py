@@ -7,9 +7,9 @@ from cryptography.hazmat.primitives.asymmetric.x25519 import X25519PrivateKey
 from hypothesis import given
 from hypothesis import strategies as st
 
-from protos.model.ids import InterfaceId, NodeName, Role, SessionId
-from protos.trust.credential import Aead, SessionCredential
-from sidecar.core.crypto.key_schedule import PairKeys, next_root, pair_keys, proof
+from plr.protos.model.ids import InterfaceId, NodeName, Role, SessionId
+from plr.protos.trust.credential import Aead, SessionCredential
+from plr.sidecar.core.crypto.key_schedule import PairKeys, next_root, pair_keys, proof
 from tests.support.builders import peer
 from tests.support.sessions import session_of, with_credential
 

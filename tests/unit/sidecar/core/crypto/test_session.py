@@ -5,16 +5,16 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from protos.base.errors import DecodeError
-from protos.model.ids import NodeName, Role, SessionId
-from protos.trust.credential import SessionCredential, decode_credential
-from sidecar.core.crypto import session as session_module
-from sidecar.core.crypto.session import OwnSession
+from plr.protos.base.errors import DecodeError
+from plr.protos.model.ids import NodeName, Role, SessionId
+from plr.protos.trust.credential import SessionCredential, decode_credential
+from plr.sidecar.core.crypto import session as session_module
+from plr.sidecar.core.crypto.session import OwnSession
 from tests.support.builders import A, B, peer
 from tests.support.sessions import credential_of, private_key, session_of
 
 if TYPE_CHECKING:
-    from protos.model.members import Peer
+    from plr.protos.model.members import Peer
 
 ENDS_AT = 1000.0
 

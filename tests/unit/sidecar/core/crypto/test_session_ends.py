@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import pytest
 
-from protos.model.ids import Role, SessionId, Version
-from protos.model.members import PeerSet, RemovalReason, RemovedPeer
-from sidecar.core.base.values import ExecutionId, PathState
-from sidecar.core.robot.request.service_catalog import WITHDRAW_AFTER_S
-from sidecar.core.seam.application import CancelExecution, ResponseArrived, WithdrawService
-from sidecar.core.seam.links import FragmentsLost, PeerClosed, PeerRestarted, Resend, SetPeers
-from sidecar.core.wire.messages import ResponseMessage
+from plr.protos.model.ids import Role, SessionId, Version
+from plr.protos.model.members import PeerSet, RemovalReason, RemovedPeer
+from plr.sidecar.core.base.values import ExecutionId, PathState
+from plr.sidecar.core.robot.request.service_catalog import WITHDRAW_AFTER_S
+from plr.sidecar.core.seam.application import CancelExecution, ResponseArrived, WithdrawService
+from plr.sidecar.core.seam.links import FragmentsLost, PeerClosed, PeerRestarted, Resend, SetPeers
+from plr.sidecar.core.wire.messages import ResponseMessage
 from tests.support.builders import ECHO, A, peer, request, request_id
 from tests.support.sessions import credential_of
 from tests.unit.sidecar.core.engine.test_engine import ROBOT, Sidecar, cloud, robot

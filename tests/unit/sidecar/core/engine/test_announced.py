@@ -9,16 +9,16 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from protos.model.ids import InterfaceId, InterfaceName, NodeName, Role, Version
-from protos.model.members import Candidate, CandidateKind, Peer, PeerSet
-from protos.trust.candidate_signature import sign_candidates, verify_candidates
-from protos.trust.clock_floor import ClockFloor
-from protos.trust.identity import IdentityRole
-from sidecar.core.crypto import session
-from sidecar.core.engine import announced as module
-from sidecar.core.engine.announced import Announced
-from sidecar.core.engine.peers import Peers
-from sidecar.state.start_session import start_session
+from plr.protos.model.ids import InterfaceId, InterfaceName, NodeName, Role, Version
+from plr.protos.model.members import Candidate, CandidateKind, Peer, PeerSet
+from plr.protos.trust.candidate_signature import sign_candidates, verify_candidates
+from plr.protos.trust.clock_floor import ClockFloor
+from plr.protos.trust.identity import IdentityRole
+from plr.sidecar.core.crypto import session
+from plr.sidecar.core.engine import announced as module
+from plr.sidecar.core.engine.announced import Announced
+from plr.sidecar.core.engine.peers import Peers
+from plr.sidecar.state.start_session import start_session
 from tests.support.builders import peer
 from tests.support.sessions import session_of
 from tests.unit.sidecar.state.test_start_session import Fleet
@@ -26,7 +26,7 @@ from tests.unit.sidecar.state.test_start_session import Fleet
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from protos.program.tls_files import TlsFiles
+    from plr.protos.program.tls_files import TlsFiles
 
 pytestmark = pytest.mark.audit("sec-5")
 

@@ -4,16 +4,16 @@ from dataclasses import replace
 
 import pytest
 
-from protos.model.ids import InterfaceName, NodeName, Role, ServiceName, SessionId, Version
-from protos.model.mapping import Assignment, MappingSet, ServiceMapping
-from protos.model.members import Peer, PeerSet, ServiceOffer, ServiceUse
-from protos.model.redundancy_mode import RedundancyMode
-from sidecar.core.base.report_scope import ReportScope
-from sidecar.core.base.values import PathId, PathState, Priority, RejectReason
-from sidecar.core.engine.engine import SWEEP_EVERY_S, Engine, EngineConfig
-from sidecar.core.message.reassembly import OVER_REMEMBERED
-from sidecar.core.rules.budget import Budget
-from sidecar.core.seam.application import (
+from plr.protos.model.ids import InterfaceName, NodeName, Role, ServiceName, SessionId, Version
+from plr.protos.model.mapping import Assignment, MappingSet, ServiceMapping
+from plr.protos.model.members import Peer, PeerSet, ServiceOffer, ServiceUse
+from plr.protos.model.redundancy_mode import RedundancyMode
+from plr.sidecar.core.base.report_scope import ReportScope
+from plr.sidecar.core.base.values import PathId, PathState, Priority, RejectReason
+from plr.sidecar.core.engine.engine import SWEEP_EVERY_S, Engine, EngineConfig
+from plr.sidecar.core.message.reassembly import OVER_REMEMBERED
+from plr.sidecar.core.rules.budget import Budget
+from plr.sidecar.core.seam.application import (
     AbandonExecution,
     ApplicationEvent,
     CancelExecution,
@@ -22,7 +22,7 @@ from sidecar.core.seam.application import (
     RequestFailed,
     ResponseArrived,
 )
-from sidecar.core.seam.links import (
+from plr.sidecar.core.seam.links import (
     FinishedLost,
     FragmentsReceived,
     LinkCommand,
@@ -34,8 +34,8 @@ from sidecar.core.seam.links import (
     SendFinished,
     SetPeers,
 )
-from sidecar.core.wire.frame import BASE_SYMBOL_BYTES, Fragment
-from sidecar.core.wire.messages import (
+from plr.sidecar.core.wire.frame import BASE_SYMBOL_BYTES, Fragment
+from plr.sidecar.core.wire.messages import (
     CancelMessage,
     Message,
     RejectionMessage,

@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from protos.base.errors import DecodeError
-from protos.model.ids import InterfaceId, InterfaceName, NodeName, Role, ServiceName, SessionId, Version
-from protos.model.members import (
+from plr.protos.base.errors import DecodeError
+from plr.protos.model.ids import InterfaceId, InterfaceName, NodeName, Role, ServiceName, SessionId, Version
+from plr.protos.model.members import (
     MAX_PEERS,
     NO_POLICY,
     POLICY_PENDING,
@@ -22,15 +22,15 @@ from protos.model.members import (
     RemovalReason,
     RemovedPeer,
 )
-from protos.trust.identity import MALFORMED, NOT_YET_VALID, UNTRUSTED, CertificateError
-from sidecar.core.crypto.session import OwnSession
-from sidecar.core.engine.peers import RESTART_GAP_S, Peers
-from sidecar.core.seam.links import PeerRestarted
+from plr.protos.trust.identity import MALFORMED, NOT_YET_VALID, UNTRUSTED, CertificateError
+from plr.sidecar.core.crypto.session import OwnSession
+from plr.sidecar.core.engine.peers import RESTART_GAP_S, Peers
+from plr.sidecar.core.seam.links import PeerRestarted
 from tests.support.builders import ECHO, A, B, peer
 from tests.support.sessions import credential_of, private_key, session_of, with_credential
 
 if TYPE_CHECKING:
-    from protos.trust.credential import SessionCredential
+    from plr.protos.trust.credential import SessionCredential
 
 OWN = session_of("robot-1", Role.ROBOT, 99)
 HELD = peer(A, session=1), peer(B, session=2)

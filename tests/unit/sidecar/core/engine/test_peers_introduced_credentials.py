@@ -11,22 +11,22 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from protos.base.errors import DecodeError
-from protos.model.ids import NodeName, Role, SessionId, Version
-from protos.model.members import POLICY_PENDING, PeerSet
-from protos.trust.credential import decode_credential
-from sidecar.core.crypto.session import OwnSession
-from sidecar.core.engine.peers import Peers
-from sidecar.core.engine.verification_budget import ALL_LOOKS_AT_ONCE, ALL_LOOKS_PER_S, LOOKS_AT_ONCE, LOOKS_PER_S
-from sidecar.core.seam.links import PeerRenewed, PeerRestarted
+from plr.protos.base.errors import DecodeError
+from plr.protos.model.ids import NodeName, Role, SessionId, Version
+from plr.protos.model.members import POLICY_PENDING, PeerSet
+from plr.protos.trust.credential import decode_credential
+from plr.sidecar.core.crypto.session import OwnSession
+from plr.sidecar.core.engine.peers import Peers
+from plr.sidecar.core.engine.verification_budget import ALL_LOOKS_AT_ONCE, ALL_LOOKS_PER_S, LOOKS_AT_ONCE, LOOKS_PER_S
+from plr.sidecar.core.seam.links import PeerRenewed, PeerRestarted
 from tests.support.builders import A, B, peer
 from tests.support.sessions import credential_of, private_key
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from protos.model.members import Peer
-    from protos.trust.credential import SessionCredential
+    from plr.protos.model.members import Peer
+    from plr.protos.trust.credential import SessionCredential
 
 HELD = peer(A, session=1), peer(B, session=2)
 FORGED, GENUINE = 9, 2

@@ -2,8 +2,8 @@ from __future__ import annotations
 
 import pytest
 
-from protos.model.ids import NodeName
-from sidecar.core.engine.verification_budget import LOOKS_AT_ONCE, VerificationBudget
+from plr.protos.model.ids import NodeName
+from plr.sidecar.core.engine.verification_budget import LOOKS_AT_ONCE, VerificationBudget
 
 
 @pytest.mark.audit("sec-5")

@@ -1,6 +1,6 @@
 from __future__ import annotations
 
-from sidecar.core.interfaces.readiness import STUN_GRACE_S, Readiness
+from plr.sidecar.core.interfaces.readiness import STUN_GRACE_S, Readiness
 from tests.support.builders import WLAN, WWAN
 
 BOTH = frozenset({4, 6})

@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import pytest
 
-from sidecar.core.interfaces.scan_schedule import (
+from plr.sidecar.core.interfaces.scan_schedule import (
     BUSY_FACTOR,
     DEBOUNCE_S,
     MAX_GAP_S,

@@ -4,13 +4,13 @@ import random
 
 import pytest
 
-from protos.model.ids import InterfaceId, InterfaceName, NodeName, Role, SessionId
-from sidecar.core.base.values import PathId, PathState
-from sidecar.core.link.link import Link
-from sidecar.core.path.congestion.rtt import UNSTABLE_FLOOR_S
-from sidecar.core.path.path import DOWN_FACTOR, DOWN_FLOOR_S
-from sidecar.core.path.probing import IDLE_PROBE_S, MAX_PROBE_S
-from sidecar.core.seam.links import (
+from plr.protos.model.ids import InterfaceId, InterfaceName, NodeName, Role, SessionId
+from plr.sidecar.core.base.values import PathId, PathState
+from plr.sidecar.core.link.link import Link
+from plr.sidecar.core.path.congestion.rtt import UNSTABLE_FLOOR_S
+from plr.sidecar.core.path.path import DOWN_FACTOR, DOWN_FLOOR_S
+from plr.sidecar.core.path.probing import IDLE_PROBE_S, MAX_PROBE_S
+from plr.sidecar.core.seam.links import (
     CheckPaths,
     FragmentsLost,
     PathChanged,
@@ -25,9 +25,9 @@ from sidecar.core.seam.links import (
     SetPeers,
     SetReady,
 )
-from sidecar.core.wire import frame
-from sidecar.core.wire.frame import Probe, ProbeReply
-from sidecar.core.wire.introduction import Introduction
+from plr.sidecar.core.wire import frame
+from plr.sidecar.core.wire.frame import Probe, ProbeReply
+from plr.sidecar.core.wire.introduction import Introduction
 from tests.support.builders import (
     FIRST,
     OUR_INCARNATION,

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from sidecar.core.link.link import MAX_FINISHED_DELAY_S
-from sidecar.core.seam.links import FragmentsLost, Send, SendFinished
-from sidecar.core.wire import frame
-from sidecar.core.wire.frame import BASE_SYMBOL_BYTES, AckFrame, Finished, Fragment
+from plr.sidecar.core.link.link import MAX_FINISHED_DELAY_S
+from plr.sidecar.core.seam.links import FragmentsLost, Send, SendFinished
+from plr.sidecar.core.wire import frame
+from plr.sidecar.core.wire.frame import BASE_SYMBOL_BYTES, AckFrame, Finished, Fragment
 from tests.support.builders import message
 from tests.unit.sidecar.core.link.test_link import PATH, fragment, numbers, up
 

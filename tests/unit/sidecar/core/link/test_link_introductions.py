@@ -7,14 +7,14 @@ from typing import Any
 
 import pytest
 
-from protos.model.ids import InterfaceId, NodeName
-from sidecar.core.base.values import PathId, PathState
-from sidecar.core.link.path_table import MAX_PATHS_OF_A_PEER, NEW_PATHS, NEW_PATHS_PER_S
-from sidecar.core.path.probing import FIRST_PROBE_S
-from sidecar.core.seam.links import PathChanged, SetCredential
-from sidecar.core.wire import frame
-from sidecar.core.wire.frame import Probe, ProbeReply
-from sidecar.core.wire.introduction import Introduction
+from plr.protos.model.ids import InterfaceId, NodeName
+from plr.sidecar.core.base.values import PathId, PathState
+from plr.sidecar.core.link.path_table import MAX_PATHS_OF_A_PEER, NEW_PATHS, NEW_PATHS_PER_S
+from plr.sidecar.core.path.probing import FIRST_PROBE_S
+from plr.sidecar.core.seam.links import PathChanged, SetCredential
+from plr.sidecar.core.wire import frame
+from plr.sidecar.core.wire.frame import Probe, ProbeReply
+from plr.sidecar.core.wire.introduction import Introduction
 from tests.support.builders import PEER_ADDRESS, WLAN, A, Bench
 from tests.unit.sidecar.core.link.test_link import (
     ELSEWHERE,

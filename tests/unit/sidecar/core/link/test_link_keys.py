@@ -8,23 +8,23 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from protos.base.errors import DecodeError
-from protos.model.ids import InterfaceId, NodeName, Role, SessionId
-from sidecar.core.link.link import Link
-from sidecar.core.link.sender import LinkIdentity
-from sidecar.core.path.key_exchange import DEFAULT_LIMITS, EXCHANGES_AT_ONCE
-from sidecar.core.path.keys import make_path_keys
-from sidecar.core.path.pmtu import HEADERS_V4
-from sidecar.core.seam.links import LinkPeer, SetMtu, SetPeers, SetReady
-from sidecar.core.wire import frame
-from sidecar.core.wire.frame import BASE_BYTES, Header, KeyAnswer, KeyOffer, Probe, ProbeReply
-from sidecar.core.wire.introduction import encode_introduction
+from plr.protos.base.errors import DecodeError
+from plr.protos.model.ids import InterfaceId, NodeName, Role, SessionId
+from plr.sidecar.core.link.link import Link
+from plr.sidecar.core.link.sender import LinkIdentity
+from plr.sidecar.core.path.key_exchange import DEFAULT_LIMITS, EXCHANGES_AT_ONCE
+from plr.sidecar.core.path.keys import make_path_keys
+from plr.sidecar.core.path.pmtu import HEADERS_V4
+from plr.sidecar.core.seam.links import LinkPeer, SetMtu, SetPeers, SetReady
+from plr.sidecar.core.wire import frame
+from plr.sidecar.core.wire.frame import BASE_BYTES, Header, KeyAnswer, KeyOffer, Probe, ProbeReply
+from plr.sidecar.core.wire.introduction import encode_introduction
 from tests.support.builders import OUR_ID, OUR_TOKEN, PEER_ADDRESS, WLAN, Bench, peer
 from tests.support.sessions import credential_of, seal, session_of
 from tests.unit.sidecar.core.link.test_link import PROBE, fragment, up
 
 if TYPE_CHECKING:
-    from sidecar.core.path.keys import PathKeys
+    from plr.sidecar.core.path.keys import PathKeys
 
 RNG = random.Random(3)
 

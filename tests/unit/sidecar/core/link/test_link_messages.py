@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import pytest
 
-from sidecar.core.message.outbound import OutboundMessage
-from sidecar.core.path.received import MAX_ACK_DELAY_S
-from sidecar.core.seam.links import (
+from plr.sidecar.core.message.outbound import OutboundMessage
+from plr.sidecar.core.path.received import MAX_ACK_DELAY_S
+from plr.sidecar.core.seam.links import (
     FinishedLost,
     FragmentsLost,
     FragmentsReceived,
@@ -15,9 +15,9 @@ from sidecar.core.seam.links import (
     SendFinished,
     SetCarrier,
 )
-from sidecar.core.wire import frame
-from sidecar.core.wire.frame import AckFrame, Finished, Fragment
-from sidecar.core.wire.messages import Encoded
+from plr.sidecar.core.wire import frame
+from plr.sidecar.core.wire.frame import AckFrame, Finished, Fragment
+from plr.sidecar.core.wire.messages import Encoded
 from tests.support.builders import PEER_SESSION, A, message
 from tests.unit.sidecar.core.link.test_link import (
     PATH,

@@ -6,12 +6,12 @@ from typing import Any
 
 import pytest
 
-from protos.model.ids import InterfaceId
-from sidecar.core.path.probing import FIRST_PROBE_S
-from sidecar.core.seam.links import Send
-from sidecar.core.wire import frame
-from sidecar.core.wire.frame import ProbeReply
-from sidecar.core.wire.introduction import Introduction
+from plr.protos.model.ids import InterfaceId
+from plr.sidecar.core.path.probing import FIRST_PROBE_S
+from plr.sidecar.core.seam.links import Send
+from plr.sidecar.core.wire import frame
+from plr.sidecar.core.wire.frame import ProbeReply
+from plr.sidecar.core.wire.introduction import Introduction
 from tests.support.builders import Bench, message
 from tests.unit.sidecar.core.link.test_link import (
     ELSEWHERE,

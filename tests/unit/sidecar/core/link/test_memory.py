@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import pytest
 
-from protos.model.ids import InterfaceId, NodeName, Role, SessionId
-from sidecar.core.link import memory as link_memory
-from sidecar.core.link.memory import MAX_PATHS_OF_A_PEER, LinkMemory
-from sidecar.core.path.key_exchange import DEFAULT_LIMITS
-from sidecar.core.path.keys import PathKeys, make_path_keys
+from plr.protos.model.ids import InterfaceId, NodeName, Role, SessionId
+from plr.sidecar.core.link import memory as link_memory
+from plr.sidecar.core.link.memory import MAX_PATHS_OF_A_PEER, LinkMemory
+from plr.sidecar.core.path.key_exchange import DEFAULT_LIMITS
+from plr.sidecar.core.path.keys import PathKeys, make_path_keys
 from tests.support.builders import peer
 from tests.support.sessions import session_of
 

@@ -4,16 +4,16 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from sidecar.core.message.outbound import OutboundMessage
-from sidecar.core.path.pmtu import PROBE_TIMEOUT_S
-from sidecar.core.seam.links import FragmentsLost, PathMtuChanged, Send, SetMtu
-from sidecar.core.wire import frame
-from sidecar.core.wire.frame import BASE_BYTES, Probe, ProbeReply
+from plr.sidecar.core.message.outbound import OutboundMessage
+from plr.sidecar.core.path.pmtu import PROBE_TIMEOUT_S
+from plr.sidecar.core.seam.links import FragmentsLost, PathMtuChanged, Send, SetMtu
+from plr.sidecar.core.wire import frame
+from plr.sidecar.core.wire.frame import BASE_BYTES, Probe, ProbeReply
 from tests.support.builders import PEER_ADDRESS, Bench, message, path
 from tests.unit.sidecar.core.link.test_link import up
 
 if TYPE_CHECKING:
-    from protos.model.ids import Address
+    from plr.protos.model.ids import Address
 
 PATH = path()
 

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import pytest
 
-from protos.model.ids import InterfaceId
-from sidecar.core.base.values import PathId, PathState
-from sidecar.core.link.pinging import LEAST_BYTES, MAX_PINGS_OUT, PINGS_AT_ONCE, PINGS_PER_S, Pong
-from sidecar.core.seam.links import Ping, SetCarrier
-from sidecar.core.wire import frame
-from sidecar.core.wire.frame import BASE_BYTES, Probe, ProbeReply
-from sidecar.core.wire.introduction import Introduction
+from plr.protos.model.ids import InterfaceId
+from plr.sidecar.core.base.values import PathId, PathState
+from plr.sidecar.core.link.pinging import LEAST_BYTES, MAX_PINGS_OUT, PINGS_AT_ONCE, PINGS_PER_S, Pong
+from plr.sidecar.core.seam.links import Ping, SetCarrier
+from plr.sidecar.core.wire import frame
+from plr.sidecar.core.wire.frame import BASE_BYTES, Probe, ProbeReply
+from plr.sidecar.core.wire.introduction import Introduction
 from tests.support.builders import WLAN, A, Bench
 
 pytestmark = pytest.mark.audit("ops-14")

@@ -8,23 +8,23 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from protos.model.ids import NodeName, SessionId
-from sidecar.core.message import decoding
-from sidecar.core.message.decoding import MAX_BYTES, Decoding, DecodingLine
-from sidecar.core.message.outbound import OutboundMessage
-from sidecar.core.message.partial import SLICE_OPERATIONS, Partial
-from sidecar.core.message.reassembly import Reassembler
-from sidecar.core.seam.links import SendFinished, SendForgotten
-from sidecar.core.seam.stats import EngineStats
-from sidecar.core.transfer.inbound import Inbound
-from sidecar.core.wire import fec
-from sidecar.core.wire.fec import MAX_BLOCK, decoding_cost
-from sidecar.core.wire.frame import Fragment, symbol_count
-from sidecar.core.wire.messages import Encoded
+from plr.protos.model.ids import NodeName, SessionId
+from plr.sidecar.core.message import decoding
+from plr.sidecar.core.message.decoding import MAX_BYTES, Decoding, DecodingLine
+from plr.sidecar.core.message.outbound import OutboundMessage
+from plr.sidecar.core.message.partial import SLICE_OPERATIONS, Partial
+from plr.sidecar.core.message.reassembly import Reassembler
+from plr.sidecar.core.seam.links import SendFinished, SendForgotten
+from plr.sidecar.core.seam.stats import EngineStats
+from plr.sidecar.core.transfer.inbound import Inbound
+from plr.sidecar.core.wire import fec
+from plr.sidecar.core.wire.fec import MAX_BLOCK, decoding_cost
+from plr.sidecar.core.wire.frame import Fragment, symbol_count
+from plr.sidecar.core.wire.messages import Encoded
 from tests.support.builders import WLAN, A, path
 
 if TYPE_CHECKING:
-    from sidecar.core.seam.links import PathCommand
+    from plr.sidecar.core.seam.links import PathCommand
 
 pytestmark = pytest.mark.audit("dp-10")
 

@@ -4,9 +4,9 @@ import random
 
 import pytest
 
-from sidecar.core.message.outbound import OutboundMessage
-from sidecar.core.wire import fec
-from sidecar.core.wire.messages import Encoded
+from plr.sidecar.core.message.outbound import OutboundMessage
+from plr.sidecar.core.wire import fec
+from plr.sidecar.core.wire.messages import Encoded
 from tests.support.builders import A, message, path
 
 

@@ -6,9 +6,9 @@ from collections import Counter
 
 import pytest
 
-from sidecar.core.message.outbound import OutboundMessage
-from sidecar.core.message.partial import Partial
-from sidecar.core.message.reassembly import (
+from plr.sidecar.core.message.outbound import OutboundMessage
+from plr.sidecar.core.message.partial import Partial
+from plr.sidecar.core.message.reassembly import (
     MAX_AGE_S,
     MAX_PEER_BYTES,
     MAX_PEER_MESSAGES,
@@ -17,8 +17,8 @@ from sidecar.core.message.reassembly import (
     Reassembled,
     Reassembler,
 )
-from sidecar.core.wire.frame import MAX_MESSAGE_BYTES, Fragment, symbol_count
-from sidecar.core.wire.messages import Encoded
+from plr.sidecar.core.wire.frame import MAX_MESSAGE_BYTES, Fragment, symbol_count
+from plr.sidecar.core.wire.messages import Encoded
 from tests.support.builders import A, path
 
 SYMBOL = 256

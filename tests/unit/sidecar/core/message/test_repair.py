@@ -4,7 +4,7 @@ import random
 
 import pytest
 
-from sidecar.core.message.repair import (
+from plr.sidecar.core.message.repair import (
     FAILURES,
     FLOOR,
     MAX_COPIES,
@@ -14,7 +14,7 @@ from sidecar.core.message.repair import (
     repair_symbols,
     worth_a_copy,
 )
-from sidecar.core.wire import fec
+from plr.sidecar.core.wire import fec
 
 COUNTS = (1, 2, 3, 5, 20, 128, 129, 132, 1000, 14_700)
 

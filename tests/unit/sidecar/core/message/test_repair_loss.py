@@ -4,7 +4,7 @@ import random
 
 import pytest
 
-from sidecar.core.message.repair import FLOOR, MAX_DISPERSION, LossEstimate
+from plr.sidecar.core.message.repair import FLOOR, MAX_DISPERSION, LossEstimate
 
 
 def measured(rng: random.Random, share: float, windows: int, *, burst: int = 1, size: int = 130) -> LossEstimate:

@@ -4,10 +4,10 @@ from collections import Counter
 
 import pytest
 
-from protos.model.ids import InterfaceId
-from sidecar.core.base.values import PathId, PathState
-from sidecar.core.path.history import MAX_REMEMBERED, Change, PathHistory
-from sidecar.core.seam.links import PathChanged
+from plr.protos.model.ids import InterfaceId
+from plr.sidecar.core.base.values import PathId, PathState
+from plr.sidecar.core.path.history import MAX_REMEMBERED, Change, PathHistory
+from plr.sidecar.core.seam.links import PathChanged
 from tests.support.builders import WLAN, A
 
 pytestmark = pytest.mark.audit("ops-14")

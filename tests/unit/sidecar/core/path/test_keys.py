@@ -6,14 +6,14 @@ from typing import Any
 import pytest
 from cryptography.exceptions import InvalidTag
 
-from protos.base.errors import DecodeError
-from protos.model.ids import InterfaceId, Role
-from protos.trust.credential import Aead
-from sidecar.core.crypto.aead import TAG_BYTES
-from sidecar.core.crypto.key_schedule import proof_of_offer
-from sidecar.core.path.key_exchange import OTHER_OFFER_AFTER_S, KeyLimits
-from sidecar.core.path.keys import LATE_S, OpeningKeys, PathKeys, make_path_keys
-from sidecar.core.wire.frame import CLEAR, HEADER_BYTES, NONCE_OFFSET, PHASE_FLAG, KeyAnswer, KeyOffer
+from plr.protos.base.errors import DecodeError
+from plr.protos.model.ids import InterfaceId, Role
+from plr.protos.trust.credential import Aead
+from plr.sidecar.core.crypto.aead import TAG_BYTES
+from plr.sidecar.core.crypto.key_schedule import proof_of_offer
+from plr.sidecar.core.path.key_exchange import OTHER_OFFER_AFTER_S, KeyLimits
+from plr.sidecar.core.path.keys import LATE_S, OpeningKeys, PathKeys, make_path_keys
+from plr.sidecar.core.wire.frame import CLEAR, HEADER_BYTES, NONCE_OFFSET, PHASE_FLAG, KeyAnswer, KeyOffer
 from tests.support.builders import peer
 from tests.support.sessions import agree, session_of, with_credential
 

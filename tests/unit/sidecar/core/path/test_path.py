@@ -4,14 +4,14 @@ import random
 
 import pytest
 
-from protos.base.token_bucket import TokenBucket
-from protos.model.ids import Address, InterfaceId, Role, SessionId
-from sidecar.core.base.values import PathState
-from sidecar.core.path.congestion.rtt import UNSTABLE_FLOOR_S
-from sidecar.core.path.key_exchange import DEFAULT_LIMITS
-from sidecar.core.path.keys import make_path_keys
-from sidecar.core.path.path import DOWN_FACTOR, DOWN_FLOOR_S, MAX_RTT_SAMPLES, Path
-from sidecar.core.path.probing import FIRST_PROBE_S, IDLE_PROBE_S, MAX_PROBE_S
+from plr.protos.base.token_bucket import TokenBucket
+from plr.protos.model.ids import Address, InterfaceId, Role, SessionId
+from plr.sidecar.core.base.values import PathState
+from plr.sidecar.core.path.congestion.rtt import UNSTABLE_FLOOR_S
+from plr.sidecar.core.path.key_exchange import DEFAULT_LIMITS
+from plr.sidecar.core.path.keys import make_path_keys
+from plr.sidecar.core.path.path import DOWN_FACTOR, DOWN_FLOOR_S, MAX_RTT_SAMPLES, Path
+from plr.sidecar.core.path.probing import FIRST_PROBE_S, IDLE_PROBE_S, MAX_PROBE_S
 from tests.support.builders import path, peer
 from tests.support.sessions import agree, session_of, with_credential
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 
 import pytest
 
-from sidecar.core.path.pmtu import (
+from plr.sidecar.core.path.pmtu import (
     COMMON_MTUS,
     MAX_PROBES,
     PROBE_TIMEOUT_S,
@@ -17,7 +17,7 @@ from sidecar.core.path.pmtu import (
     PathMtu,
     payloads,
 )
-from sidecar.core.wire.frame import BASE_BYTES, MAX_DATAGRAM_BYTES
+from plr.sidecar.core.wire.frame import BASE_BYTES, MAX_DATAGRAM_BYTES
 
 RTT_S = 0.05
 ETHERNET, JUMBO = payloads(1500, ipv6=False), payloads(9000, ipv6=False)

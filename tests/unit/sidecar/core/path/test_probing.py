@@ -5,8 +5,8 @@ import random
 
 import pytest
 
-from sidecar.core.path.congestion.rtt import LONGEST_ANSWER_S
-from sidecar.core.path.probing import (
+from plr.sidecar.core.path.congestion.rtt import LONGEST_ANSWER_S
+from plr.sidecar.core.path.probing import (
     FIRST_PROBE_S,
     FREE_ADDRESSES,
     IDLE_PROBE_S,

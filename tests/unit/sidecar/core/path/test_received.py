@@ -3,8 +3,8 @@ from __future__ import annotations
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sidecar.core.path.received import ACK_EVERY, MAX_ACK_DELAY_S, STALE_PACKETS, ReceivedPackets
-from sidecar.core.wire.frame import MAX_ACK_RANGES
+from plr.sidecar.core.path.received import ACK_EVERY, MAX_ACK_DELAY_S, STALE_PACKETS, ReceivedPackets
+from plr.sidecar.core.wire.frame import MAX_ACK_RANGES
 
 
 def received(*numbers: int) -> ReceivedPackets:

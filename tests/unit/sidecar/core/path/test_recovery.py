@@ -5,15 +5,15 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from sidecar.core.path.received import MAX_ACK_DELAY_S, ReceivedPackets
-from sidecar.core.path.recovery import PTO_DATAGRAMS, Recovery
-from sidecar.core.path.reordering import PACKET_THRESHOLD
-from sidecar.core.wire import frame
-from sidecar.core.wire.frame import AckFrame
+from plr.sidecar.core.path.received import MAX_ACK_DELAY_S, ReceivedPackets
+from plr.sidecar.core.path.recovery import PTO_DATAGRAMS, Recovery
+from plr.sidecar.core.path.reordering import PACKET_THRESHOLD
+from plr.sidecar.core.wire import frame
+from plr.sidecar.core.wire.frame import AckFrame
 from tests.support.builders import message
 
 if TYPE_CHECKING:
-    from sidecar.core.path.in_flight import Sent
+    from plr.sidecar.core.path.in_flight import Sent
 
 
 def ack(*ranges: tuple[int, int], delay_s: float = 0.0) -> AckFrame:

@@ -2,10 +2,10 @@ from __future__ import annotations
 
 import pytest
 
-from sidecar.core.path.congestion.rtt import LONGEST_ANSWER_S, RttEstimator
-from sidecar.core.path.in_flight import Sent
-from sidecar.core.path.reordering import MAX_REMEMBERED, PACKET_THRESHOLD, PERSISTS, Reordering
-from sidecar.core.wire.frame import MAX_ACK_RANGES
+from plr.sidecar.core.path.congestion.rtt import LONGEST_ANSWER_S, RttEstimator
+from plr.sidecar.core.path.in_flight import Sent
+from plr.sidecar.core.path.reordering import MAX_REMEMBERED, PACKET_THRESHOLD, PERSISTS, Reordering
+from plr.sidecar.core.wire.frame import MAX_ACK_RANGES
 from tests.support.builders import message
 
 

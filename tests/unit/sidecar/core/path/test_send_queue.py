@@ -4,14 +4,14 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from sidecar.core.base.timers import NEVER
-from sidecar.core.base.values import SHARE, Priority
-from sidecar.core.path.send_queue import MAX_RUN, MAX_RUN_BYTES, PURGE_AT, SendQueue
-from sidecar.core.wire.frame import FRAGMENT_OVERHEAD_BYTES
+from plr.sidecar.core.base.timers import NEVER
+from plr.sidecar.core.base.values import SHARE, Priority
+from plr.sidecar.core.path.send_queue import MAX_RUN, MAX_RUN_BYTES, PURGE_AT, SendQueue
+from plr.sidecar.core.wire.frame import FRAGMENT_OVERHEAD_BYTES
 from tests.support.builders import message, path
 
 if TYPE_CHECKING:
-    from sidecar.core.message.outbound import OutboundMessage
+    from plr.sidecar.core.message.outbound import OutboundMessage
 
 ONE = 1
 """A budget for one symbol."""

@@ -4,12 +4,12 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from sidecar.core.base.timers import NEVER
-from sidecar.core.path.send_queue import PATIENCE, SMALL, Turn
+from plr.sidecar.core.base.timers import NEVER
+from plr.sidecar.core.path.send_queue import PATIENCE, SMALL, Turn
 from tests.support.builders import message, path
 
 if TYPE_CHECKING:
-    from sidecar.core.message.outbound import OutboundMessage
+    from plr.sidecar.core.message.outbound import OutboundMessage
 
 SIZE, PACE, ROUND_TRIP_S = 100_000, 200_000.0, 0.1
 """Half a second to send, 0.6 s to the answer."""

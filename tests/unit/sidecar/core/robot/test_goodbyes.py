@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import pytest
 
-from protos.model.ids import NodeName, SessionId
-from protos.model.report import MAX_GOODBYES
-from sidecar.core.robot.goodbyes import Goodbyes
+from plr.protos.model.ids import NodeName, SessionId
+from plr.protos.model.report import MAX_GOODBYES
+from plr.sidecar.core.robot.goodbyes import Goodbyes
 
 pytestmark = pytest.mark.audit("ops-11")
 

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from sidecar.core.base.values import PathState, Priority
-from sidecar.core.seam.application import DeadlineMissed, RequestFailed, ResponseArrived
-from sidecar.core.seam.links import Send
-from sidecar.core.wire.messages import RequestMessage, decode_message
+from plr.sidecar.core.base.values import PathState, Priority
+from plr.sidecar.core.seam.application import DeadlineMissed, RequestFailed, ResponseArrived
+from plr.sidecar.core.seam.links import Send
+from plr.sidecar.core.wire.messages import RequestMessage, decode_message
 from tests.support.builders import ECHO, TYPE, WWAN, A, B, request_id
 from tests.unit.sidecar.core.request_table import RACE, WLAN_A, WWAN_B, Table
 

@@ -6,10 +6,10 @@ from dataclasses import replace
 
 import pytest
 
-from protos.model.ids import ServiceName
-from sidecar.core.base.values import PathState, RejectReason
-from sidecar.core.rules.service_rule import FallbackRule
-from sidecar.core.seam.application import DeadlineMissed, ResponseArrived, Unreachable
+from plr.protos.model.ids import ServiceName
+from plr.sidecar.core.base.values import PathState, RejectReason
+from plr.sidecar.core.rules.service_rule import FallbackRule
+from plr.sidecar.core.seam.application import DeadlineMissed, ResponseArrived, Unreachable
 from tests.support.builders import ECHO, B, request_id
 from tests.unit.sidecar.core.request_table import RACE, SERVERS, WLAN_A, WWAN_B, Table
 

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import pytest
 
-from sidecar.core.base.values import PathState, RejectReason
-from sidecar.core.robot.dispatch.penalties import FIRST_S
-from sidecar.core.seam.application import DeadlineMissed, ResponseArrived
+from plr.sidecar.core.base.values import PathState, RejectReason
+from plr.sidecar.core.robot.dispatch.penalties import FIRST_S
+from plr.sidecar.core.seam.application import DeadlineMissed, ResponseArrived
 from tests.support.builders import ECHO, A, B, request_id
 from tests.unit.sidecar.core.request_table import RACE, WLAN_A, WWAN_B, Table
 

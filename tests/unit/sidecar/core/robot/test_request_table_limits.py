@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import pytest
 
-from sidecar.core.base.values import Priority
-from sidecar.core.robot import request_table as requests_module
-from sidecar.core.wire.messages import MAX_PAYLOAD_BYTES, Encoded
+from plr.sidecar.core.base.values import Priority
+from plr.sidecar.core.robot import request_table as requests_module
+from plr.sidecar.core.wire.messages import MAX_PAYLOAD_BYTES, Encoded
 from tests.support.builders import ECHO, A, B
 from tests.unit.sidecar.core.request_table import WLAN_A, WWAN_B, Table
 

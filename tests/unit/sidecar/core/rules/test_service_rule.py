@@ -4,8 +4,8 @@ from dataclasses import replace
 
 import pytest
 
-from protos.model.ids import ServiceName
-from sidecar.core.rules.service_rule import MAX_FOUND, FallbackRule, Rules
+from plr.protos.model.ids import ServiceName
+from plr.sidecar.core.rules.service_rule import MAX_FOUND, FallbackRule, Rules
 from tests.support.builders import rule
 
 RULES = (rule("/arm/plan"), rule("/arm/*"), rule("/node/get_parameters"), rule("/*"))

@@ -8,10 +8,10 @@ from itertools import pairwise
 
 import pytest
 
-from sidecar.core.stun.client import MAX_SERVERS_PER_FAMILY, StunClient
-from sidecar.core.stun.events import Failed, Mapped, MappingChanged, StunEvent
-from sidecar.core.stun.family import MAX_QUEUED_EVENTS, StunClientConfig
-from sidecar.core.stun.transaction import Retransmission
+from plr.sidecar.core.stun.client import MAX_SERVERS_PER_FAMILY, StunClient
+from plr.sidecar.core.stun.events import Failed, Mapped, MappingChanged, StunEvent
+from plr.sidecar.core.stun.family import MAX_QUEUED_EVENTS, StunClientConfig
+from plr.sidecar.core.stun.transaction import Retransmission
 from tests.unit.sidecar.stun_network import (
     C6,
     MOVED,

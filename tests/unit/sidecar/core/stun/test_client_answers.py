@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from protos.stun.codec import MessageClass, StunMessage, decode, encode
-from sidecar.core.stun.events import Failed, Mapped, StunDrop
+from plr.protos.stun.codec import MessageClass, StunMessage, decode, encode
+from plr.sidecar.core.stun.events import Failed, Mapped, StunDrop
 from tests.unit.sidecar.stun_network import (
     MOVED,
     OUTSIDE,

@@ -2,22 +2,22 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from sidecar.core.base.values import PathState, Priority, RequestId
-from sidecar.core.message.reassembly import MAX_PEER_BYTES
-from sidecar.core.message.repair import MAX_COPIES
-from sidecar.core.seam.links import FragmentsLost, LinkCommand, Resend, Send, SendAbandon
-from sidecar.core.seam.stats import EngineStats
-from sidecar.core.transfer.outbox import MAX_GENERATIONS, Outbox
-from sidecar.core.transfer.room import LARGE_ROOM_BYTES, MAX_MESSAGES, SMALL_BYTES, SMALL_ROOM_BYTES
-from sidecar.core.transfer.routes import Routes
-from sidecar.core.wire.frame import BASE_BYTES
-from sidecar.core.wire.messages import Encoded
+from plr.sidecar.core.base.values import PathState, Priority, RequestId
+from plr.sidecar.core.message.reassembly import MAX_PEER_BYTES
+from plr.sidecar.core.message.repair import MAX_COPIES
+from plr.sidecar.core.seam.links import FragmentsLost, LinkCommand, Resend, Send, SendAbandon
+from plr.sidecar.core.seam.stats import EngineStats
+from plr.sidecar.core.transfer.outbox import MAX_GENERATIONS, Outbox
+from plr.sidecar.core.transfer.room import LARGE_ROOM_BYTES, MAX_MESSAGES, SMALL_BYTES, SMALL_ROOM_BYTES
+from plr.sidecar.core.transfer.routes import Routes
+from plr.sidecar.core.wire.frame import BASE_BYTES
+from plr.sidecar.core.wire.messages import Encoded
 from tests.support.builders import WLAN, WWAN, A, B, path
 
 if TYPE_CHECKING:
-    from sidecar.core.base.slices import Step
-    from sidecar.core.base.values import PathId
-    from sidecar.core.message.outbound import OutboundMessage
+    from plr.sidecar.core.base.slices import Step
+    from plr.sidecar.core.base.values import PathId
+    from plr.sidecar.core.message.outbound import OutboundMessage
 
 SMALL = Encoded(b"", b"x")
 OVER_WLAN, OVER_WWAN, TO_B = path(WLAN), path(WWAN), path(WLAN, B)

@@ -1,8 +1,8 @@
 from __future__ import annotations
 
-from sidecar.core.base.values import PathState
-from sidecar.core.transfer.routes import Routes
-from sidecar.core.wire.frame import BASE_BYTES, FRAGMENT_OVERHEAD_BYTES
+from plr.sidecar.core.base.values import PathState
+from plr.sidecar.core.transfer.routes import Routes
+from plr.sidecar.core.wire.frame import BASE_BYTES, FRAGMENT_OVERHEAD_BYTES
 from tests.support.builders import WLAN, WWAN, A, B, path
 
 FAST, SLOW, SHAKY = path(WLAN, A), path(WWAN, A), path(WLAN, A, 1)

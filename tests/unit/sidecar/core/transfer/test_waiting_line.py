@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from sidecar.core.base.values import SHARE, Priority
-from sidecar.core.transfer.waiting_line import SLACK, WaitingLine
+from plr.sidecar.core.base.values import SHARE, Priority
+from plr.sidecar.core.transfer.waiting_line import SLACK, WaitingLine
 
 
 def order(line: WaitingLine[str], now: float) -> list[str]:

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sidecar.core.wire import fec
+from plr.sidecar.core.wire import fec
 
 SYMBOL = 24
 

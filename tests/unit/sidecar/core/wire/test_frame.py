@@ -2,11 +2,11 @@ from __future__ import annotations
 
 import pytest
 
-from protos.base.errors import DecodeError
-from protos.model.ids import InterfaceId, SessionId
-from sidecar.core.crypto.aead import TAG_BYTES
-from sidecar.core.wire import frame
-from sidecar.core.wire.frame import AckFrame, Close, Finished, Fragment, Header, Probe, ProbeReply
+from plr.protos.base.errors import DecodeError
+from plr.protos.model.ids import InterfaceId, SessionId
+from plr.sidecar.core.crypto.aead import TAG_BYTES
+from plr.sidecar.core.wire import frame
+from plr.sidecar.core.wire.frame import AckFrame, Close, Finished, Fragment, Header, Probe, ProbeReply
 
 HEADER = Header(InterfaceId(1), InterfaceId(2), SessionId(0x0102030405060708), 0x1112131415161718)
 CLEAR = "d3 01 01 02 01 02 03 04 05 06 07 08 11 12 13 14 15 16 17 18"

@@ -6,10 +6,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from protos.base.errors import DecodeError
-from protos.model.ids import InterfaceId, NodeName, Role, SessionId
-from sidecar.core.wire.frame import BASE_BYTES, Header, KeyOffer
-from sidecar.core.wire.introduction import (
+from plr.protos.base.errors import DecodeError
+from plr.protos.model.ids import InterfaceId, NodeName, Role, SessionId
+from plr.sidecar.core.wire.frame import BASE_BYTES, Header, KeyOffer
+from plr.sidecar.core.wire.introduction import (
     MAX_INTRODUCED_BYTES,
     Introduction,
     UnauthenticError,

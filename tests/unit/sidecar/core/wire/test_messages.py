@@ -2,11 +2,11 @@ from __future__ import annotations
 
 import pytest
 
-from protos.base.errors import DecodeError, UnknownKindError
-from protos.convert.fields import MAX_CRL_BYTES
-from protos.model.ids import ServiceName
-from sidecar.core.base.values import Priority, RejectReason, RequestId
-from sidecar.core.wire.messages import (
+from plr.protos.base.errors import DecodeError, UnknownKindError
+from plr.protos.convert.fields import MAX_CRL_BYTES
+from plr.protos.model.ids import ServiceName
+from plr.sidecar.core.base.values import Priority, RejectReason, RequestId
+from plr.sidecar.core.wire.messages import (
     MAX_PAYLOAD_BYTES,
     MAX_TEXT_BYTES,
     CancelMessage,

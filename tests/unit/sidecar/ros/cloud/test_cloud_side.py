@@ -8,14 +8,14 @@ from unittest.mock import Mock
 
 import pytest
 
-from protos.model.ids import NodeName
-from sidecar.core.base.fair_share import Shares
-from sidecar.core.base.values import ExecutionId, Priority
-from sidecar.core.seam.application import AbandonExecution
-from sidecar.ros.cloud.cloud_side import MAX_EXECUTIONS, SILENCE_S, TRUSTED_S, CloudSide
-from sidecar.ros.cloud.request_window import RequestWindow
-from sidecar.ros.cloud.service_runner import ServiceRunner
-from sidecar.ros.stats import BridgeStats
+from plr.protos.model.ids import NodeName
+from plr.sidecar.core.base.fair_share import Shares
+from plr.sidecar.core.base.values import ExecutionId, Priority
+from plr.sidecar.core.seam.application import AbandonExecution
+from plr.sidecar.ros.cloud.cloud_side import MAX_EXECUTIONS, SILENCE_S, TRUSTED_S, CloudSide
+from plr.sidecar.ros.cloud.request_window import RequestWindow
+from plr.sidecar.ros.cloud.service_runner import ServiceRunner
+from plr.sidecar.ros.stats import BridgeStats
 
 
 @pytest.fixture
@@ -134,7 +134,7 @@ def test_a_type_is_chosen_among_those_whose_servers_live(
     side: Any, monkeypatch: pytest.MonkeyPatch, used: str | None, ended: set[bytes], chosen: str
 ) -> None:
     shown = {"a/srv/Stray": {b"stray": True}, "b/srv/Used": {b"used": True}, "c/srv/Nameless": {b"nameless": False}}
-    monkeypatch.setattr("sidecar.ros.graph.graph.server_endpoints", lambda _node, _service, _name_of, _now: shown)
+    monkeypatch.setattr("plr.sidecar.ros.graph.graph.server_endpoints", lambda _node, _service, _name_of, _now: shown)
     watched: set[bytes] = set()
     side._loop = SimpleNamespace(node=None)
     side._processes = SimpleNamespace(watch=watched.add, has_ended=ended.__contains__)

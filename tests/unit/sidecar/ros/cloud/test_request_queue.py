@@ -7,8 +7,8 @@ import random
 
 import pytest
 
-from sidecar.core.base.values import Priority
-from sidecar.ros.cloud.request_queue import REMOVED_SLACK, RequestQueue
+from plr.sidecar.core.base.values import Priority
+from plr.sidecar.ros.cloud.request_queue import REMOVED_SLACK, RequestQueue
 
 
 def drain(queue: RequestQueue[str], now: float, *, late_too: bool = True) -> list[str]:

@@ -9,9 +9,9 @@ from itertools import count
 
 import pytest
 
-from sidecar.core.base.values import Priority
-from sidecar.ros.cloud.request_window import LATE_ONLY_S, SHORT_STALL_S, STALL_S, STALL_TIMES, RequestWindow
-from sidecar.ros.cloud.server_capacity import SAFE_SIZE
+from plr.sidecar.core.base.values import Priority
+from plr.sidecar.ros.cloud.request_window import LATE_ONLY_S, SHORT_STALL_S, STALL_S, STALL_TIMES, RequestWindow
+from plr.sidecar.ros.cloud.server_capacity import SAFE_SIZE
 
 _items = count()
 

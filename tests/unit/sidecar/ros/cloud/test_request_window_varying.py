@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from sidecar.ros.cloud.overlap_gain import FIRST_TRIAL_AFTER, OverlapGain
-from sidecar.ros.cloud.request_overlap import IN_ORDER, LOST_AFTER, RequestOverlap
-from sidecar.ros.cloud.request_window import RequestWindow
-from sidecar.ros.cloud.server_capacity import MOST_AT_ONCE, SAFE_SIZE
+from plr.sidecar.ros.cloud.overlap_gain import FIRST_TRIAL_AFTER, OverlapGain
+from plr.sidecar.ros.cloud.request_overlap import IN_ORDER, LOST_AFTER, RequestOverlap
+from plr.sidecar.ros.cloud.request_window import RequestWindow
+from plr.sidecar.ros.cloud.server_capacity import MOST_AT_ONCE, SAFE_SIZE
 from tests.unit.sidecar.ros.server_model import QUEUE_DEPTH, ModelServer
 
 if TYPE_CHECKING:

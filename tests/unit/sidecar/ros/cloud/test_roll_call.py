@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from sidecar.ros.cloud import roll_call
-from sidecar.ros.cloud.roll_call import CALL_S, CALLS_MISSED, RollCall
+from plr.sidecar.ros.cloud import roll_call
+from plr.sidecar.ros.cloud.roll_call import CALL_S, CALLS_MISSED, RollCall
 from tests.support.participant_messages import endpoint, participant_info
 
 if TYPE_CHECKING:

@@ -7,10 +7,10 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from sidecar.core.base.values import Priority
-from sidecar.ros.cloud.request_overlap import LOST_AFTER, REMEMBERED
-from sidecar.ros.cloud.request_window import RequestWindow
-from sidecar.ros.cloud.server_capacity import MOST_AT_ONCE, SAFE_SIZE, ServerCapacity
+from plr.sidecar.core.base.values import Priority
+from plr.sidecar.ros.cloud.request_overlap import LOST_AFTER, REMEMBERED
+from plr.sidecar.ros.cloud.request_window import RequestWindow
+from plr.sidecar.ros.cloud.server_capacity import MOST_AT_ONCE, SAFE_SIZE, ServerCapacity
 from tests.unit.sidecar.ros.server_model import ModelServer, always, varying
 
 if TYPE_CHECKING:

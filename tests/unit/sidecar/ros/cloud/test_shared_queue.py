@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import pytest
 
-from sidecar.core.base.values import Priority
-from sidecar.ros.cloud.request_window import RequestWindow
-from sidecar.ros.cloud.shared_queue import SHARED_ONE_IN, SharedQueue
+from plr.sidecar.core.base.values import Priority
+from plr.sidecar.ros.cloud.request_window import RequestWindow
+from plr.sidecar.ros.cloud.shared_queue import SHARED_ONE_IN, SharedQueue
 
 SERVER_S = 0.0015
 STEP_S = 0.0005

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from sidecar.ros.graph.looks import FIRST_SETTLING_S, IDLE_PERIOD_S, REST, TURN_S, Looks
+from plr.sidecar.ros.graph.looks import FIRST_SETTLING_S, IDLE_PERIOD_S, REST, TURN_S, Looks
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

@@ -7,11 +7,11 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from sidecar.ros.graph import node_names
-from sidecar.ros.graph.node_names import CALL_S, POLL_S, NodeNames
-from sidecar.ros.graph.unknown_nodes import MAX_ENDPOINTS, UNKNOWN_FOR_S
-from sidecar.ros.log_limit import LimitedLog
-from sidecar.ros.stats import BridgeStats
+from plr.sidecar.ros.graph import node_names
+from plr.sidecar.ros.graph.node_names import CALL_S, POLL_S, NodeNames
+from plr.sidecar.ros.graph.unknown_nodes import MAX_ENDPOINTS, UNKNOWN_FOR_S
+from plr.sidecar.ros.log_limit import LimitedLog
+from plr.sidecar.ros.stats import BridgeStats
 from tests.support.participant_messages import endpoint, participant_info
 
 if TYPE_CHECKING:
@@ -53,7 +53,7 @@ def stats() -> BridgeStats:
 @pytest.fixture
 def names(monkeypatch: pytest.MonkeyPatch, stats: BridgeStats) -> NodeNames:
     monkeypatch.setattr(node_names, "DiscoveryTopic", Topic)
-    return NodeNames(None, stats, LimitedLog(logging.getLogger("sidecar")))
+    return NodeNames(None, stats, LimitedLog(logging.getLogger("plr.sidecar")))
 
 
 def topic_of(names: NodeNames) -> Topic:
@@ -70,7 +70,7 @@ def look(names: NodeNames, now: float, *endpoints: bytes) -> list[str | None]:
 
 
 def test_a_call_ends_when_all_have_answered(names: NodeNames, caplog: pytest.LogCaptureFixture) -> None:
-    caplog.set_level(logging.INFO, "sidecar")
+    caplog.set_level(logging.INFO, "plr.sidecar")
     topic = topic_of(names)
     assert names.next_due() is None
     look(names, 0.0, PLAN)

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from sidecar.ros.errors import RosBridgeError
-from sidecar.ros.graph.participant_info import MAX_INFO_BYTES, MAX_NODES, nodes_of, speaker
+from plr.sidecar.ros.errors import RosBridgeError
+from plr.sidecar.ros.graph.participant_info import MAX_INFO_BYTES, MAX_NODES, nodes_of, speaker
 from tests.support.participant_messages import Node, endpoint, participant_info
 
 READERS = [endpoint(7, 1), endpoint(7, 2)]

@@ -4,8 +4,14 @@ from __future__ import annotations
 
 import itertools
 
-from sidecar.ros.cloud.dds_id import participant_of
-from sidecar.ros.graph.unknown_nodes import MAX_ENDPOINTS, MAX_PARTICIPANTS, MAX_PAUSE_S, UNKNOWN_FOR_S, UnknownNodes
+from plr.sidecar.ros.cloud.dds_id import participant_of
+from plr.sidecar.ros.graph.unknown_nodes import (
+    MAX_ENDPOINTS,
+    MAX_PARTICIPANTS,
+    MAX_PAUSE_S,
+    UNKNOWN_FOR_S,
+    UnknownNodes,
+)
 from tests.support.participant_messages import endpoint, participant_info
 
 PLAN, NEGATE = endpoint(7, 3), endpoint(7, 4)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import random
 
-from sidecar.ros.robot.new_clients import GIVE_UP_S, MAX_KEPT, MAX_RETRY_S, REST_S, NewClients
+from plr.sidecar.ros.robot.new_clients import GIVE_UP_S, MAX_KEPT, MAX_RETRY_S, REST_S, NewClients
 
 
 def test_answers_stay_in_order_and_go_when_the_client_is_known() -> None:

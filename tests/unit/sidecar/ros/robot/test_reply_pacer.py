@@ -7,7 +7,7 @@ import random
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sidecar.ros.robot.reply_pacer import BURST_ANSWERS, LATE_COST, MAX_CLIENTS, SPACING_S, ReplyPacer
+from plr.sidecar.ros.robot.reply_pacer import BURST_ANSWERS, LATE_COST, MAX_CLIENTS, SPACING_S, ReplyPacer
 
 A, B = b"a" * 16, b"b" * 16
 

@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import pytest
 
-from sidecar.core.path.congestion.controller import (
+from plr.sidecar.core.path.congestion.controller import (
     INITIAL_WINDOW_BYTES,
     MAX_BURST_BYTES,
     MIN_WINDOW_BYTES,
@@ -13,10 +13,10 @@ from sidecar.core.path.congestion.controller import (
     RateSample,
     burst,
 )
-from sidecar.core.path.congestion.delivery_rate import FRESH_S
-from sidecar.core.path.congestion.loss_ceiling import CUT
-from sidecar.core.path.congestion.rtt import RttEstimator
-from sidecar.core.path.congestion.units import DATAGRAM_BYTES
+from plr.sidecar.core.path.congestion.delivery_rate import FRESH_S
+from plr.sidecar.core.path.congestion.loss_ceiling import CUT
+from plr.sidecar.core.path.congestion.rtt import RttEstimator
+from plr.sidecar.core.path.congestion.units import DATAGRAM_BYTES
 
 RTT_S = 0.1
 RATE = 1_000_000.0

@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import pytest
 
-from sidecar.core.path.congestion.delivery_rate import BELIEVED_ROUNDS, MAX_TRAINS, ROUNDS, DeliveryRate
+from plr.sidecar.core.path.congestion.delivery_rate import BELIEVED_ROUNDS, MAX_TRAINS, ROUNDS, DeliveryRate
 
 SIZE = 1200
 RTT_S = 0.05

@@ -2,9 +2,9 @@ from __future__ import annotations
 
 import pytest
 
-from sidecar.core.path.congestion.loss_ceiling import CUT, LEAST_BYTES, MEMORY_S, LossCeiling
-from sidecar.core.path.congestion.rtt import RttEstimator
-from sidecar.core.path.congestion.units import DATAGRAM_BYTES
+from plr.sidecar.core.path.congestion.loss_ceiling import CUT, LEAST_BYTES, MEMORY_S, LossCeiling
+from plr.sidecar.core.path.congestion.rtt import RttEstimator
+from plr.sidecar.core.path.congestion.units import DATAGRAM_BYTES
 
 FLOOR_S = 0.050
 IN_FLIGHT = 100 * DATAGRAM_BYTES

@@ -2,8 +2,8 @@ from __future__ import annotations
 
 import pytest
 
-from sidecar.core.path.congestion.policer import FORGET, MARGIN, Policer
-from sidecar.core.path.congestion.units import DATAGRAM_BYTES
+from plr.sidecar.core.path.congestion.policer import FORGET, MARGIN, Policer
+from plr.sidecar.core.path.congestion.units import DATAGRAM_BYTES
 
 RTT_S = 0.05
 TOKENS = 500_000.0

@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import pytest
 
-from sidecar.core.path.congestion.rtt import (
+from plr.sidecar.core.path.congestion.rtt import (
     GRANULARITY_S,
     INITIAL_RTT_S,
     LONGEST_WAIT_S,

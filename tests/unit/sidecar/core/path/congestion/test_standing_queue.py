@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from sidecar.core.path.congestion.rtt import RttEstimator
-from sidecar.core.path.congestion.standing_queue import (
+from plr.sidecar.core.path.congestion.rtt import RttEstimator
+from plr.sidecar.core.path.congestion.standing_queue import (
     FLOOR_MEMORY_S,
     PEAK_MEMORY_S,
     YIELD_S,

@@ -6,10 +6,10 @@ from dataclasses import replace
 
 import pytest
 
-from sidecar.core.base.values import PathState, Priority
-from sidecar.core.message.reassembly import MAX_PEER_BYTES
-from sidecar.core.transfer.room import LARGE_ROOM_BYTES, SMALL_BYTES
-from sidecar.core.wire.messages import Encoded
+from plr.sidecar.core.base.values import PathState, Priority
+from plr.sidecar.core.message.reassembly import MAX_PEER_BYTES
+from plr.sidecar.core.transfer.room import LARGE_ROOM_BYTES, SMALL_BYTES
+from plr.sidecar.core.wire.messages import Encoded
 from tests.support.builders import ECHO, A, request_id
 from tests.unit.sidecar.core.request_table import WLAN_A, WWAN_B, Table
 

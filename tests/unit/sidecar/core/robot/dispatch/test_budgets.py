@@ -6,9 +6,9 @@ import random
 
 import pytest
 
-from sidecar.core.robot.dispatch.budgets import DAY_S, MAX_SAVED_BYTES, Budgets
-from sidecar.core.rules.budget import Budget
-from sidecar.core.seam.stats import EngineStats
+from plr.sidecar.core.robot.dispatch.budgets import DAY_S, MAX_SAVED_BYTES, Budgets
+from plr.sidecar.core.rules.budget import Budget
+from plr.sidecar.core.seam.stats import EngineStats
 from tests.support.builders import ECHO, WLAN, WWAN
 
 

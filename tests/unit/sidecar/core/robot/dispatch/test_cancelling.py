@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import pytest
 
-from sidecar.core.base.request_id import OBSERVED_ONE_IN
-from sidecar.core.base.values import PathState
-from sidecar.core.robot.dispatch.cancelling import MAX_CALLED_OFF, SMALL_ANSWER_BYTES
+from plr.sidecar.core.base.request_id import OBSERVED_ONE_IN
+from plr.sidecar.core.base.values import PathState
+from plr.sidecar.core.robot.dispatch.cancelling import MAX_CALLED_OFF, SMALL_ANSWER_BYTES
 from tests.support.builders import ECHO, WLAN, WWAN, A, B, path, request_id
 from tests.unit.sidecar.core.request_table import RACE, WLAN_A, WWAN_B, Table
 

@@ -6,10 +6,10 @@ import dataclasses
 
 import pytest
 
-from protos.model.redundancy_mode import RedundancyMode
-from sidecar.core.base.values import PathId, PathState, RejectReason
-from sidecar.core.robot.dispatch.dispatcher import MAX_COPIES
-from sidecar.core.seam.application import ResponseArrived
+from plr.protos.model.redundancy_mode import RedundancyMode
+from plr.sidecar.core.base.values import PathId, PathState, RejectReason
+from plr.sidecar.core.robot.dispatch.dispatcher import MAX_COPIES
+from plr.sidecar.core.seam.application import ResponseArrived
 from tests.support.builders import A, B, request_id
 from tests.unit.sidecar.core.request_table import RACE, SERVERS, WLAN_A, WWAN_B, Table
 

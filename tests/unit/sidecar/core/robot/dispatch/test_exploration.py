@@ -8,10 +8,10 @@ from dataclasses import replace
 
 import pytest
 
-from protos.model.ids import Version
-from protos.model.mapping import Assignment, MappingSet, ServiceMapping
-from sidecar.core.base.values import PathId, PathState, RejectReason, RequestId
-from sidecar.core.robot.dispatch.exploration import (
+from plr.protos.model.ids import Version
+from plr.protos.model.mapping import Assignment, MappingSet, ServiceMapping
+from plr.sidecar.core.base.values import PathId, PathState, RejectReason, RequestId
+from plr.sidecar.core.robot.dispatch.exploration import (
     MAX_PER_S,
     MAX_REQUEST_BYTES,
     MAX_SAVED,

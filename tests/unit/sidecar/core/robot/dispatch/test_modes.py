@@ -6,10 +6,10 @@ import dataclasses
 
 import pytest
 
-from protos.model.redundancy_mode import RedundancyMode
-from sidecar.core.base.values import PathId, PathState, RejectReason
-from sidecar.core.robot.request.request import HEDGE_AT
-from sidecar.core.rules.budget import Budget
+from plr.protos.model.redundancy_mode import RedundancyMode
+from plr.sidecar.core.base.values import PathId, PathState, RejectReason
+from plr.sidecar.core.robot.request.request import HEDGE_AT
+from plr.sidecar.core.rules.budget import Budget
 from tests.support.builders import ECHO, WLAN, WWAN, A, B, path
 from tests.unit.sidecar.core.request_table import RACE, WLAN_A, WWAN_B, Table
 

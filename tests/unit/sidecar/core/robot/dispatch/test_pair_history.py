@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import pytest
 
-from sidecar.core.base.values import PathState
-from sidecar.core.robot.dispatch import pair_history
-from sidecar.core.robot.dispatch.pair_history import FADE_S, PathPaces
-from sidecar.core.seam.stats import EngineStats
-from sidecar.core.transfer.routes import Routes
+from plr.sidecar.core.base.values import PathState
+from plr.sidecar.core.robot.dispatch import pair_history
+from plr.sidecar.core.robot.dispatch.pair_history import FADE_S, PathPaces
+from plr.sidecar.core.seam.stats import EngineStats
+from plr.sidecar.core.transfer.routes import Routes
 from tests.support.builders import ECHO, WLAN, WWAN, A, B, path
 
 WLAN_A, WWAN_B = path(WLAN, A), path(WWAN, B)

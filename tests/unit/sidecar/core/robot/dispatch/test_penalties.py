@@ -2,8 +2,8 @@ from __future__ import annotations
 
 import pytest
 
-from protos.model.ids import NodeName
-from sidecar.core.robot.dispatch.penalties import FIRST_S, HALF_LIFE_S, LONGEST_S, MAX_SERVERS, Penalties
+from plr.protos.model.ids import NodeName
+from plr.sidecar.core.robot.dispatch.penalties import FIRST_S, HALF_LIFE_S, LONGEST_S, MAX_SERVERS, Penalties
 
 A, B = NodeName("cloud-a"), NodeName("cloud-b")
 

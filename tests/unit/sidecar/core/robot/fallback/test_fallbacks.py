@@ -8,15 +8,15 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from protos.model.ids import ServiceName
-from sidecar.core.robot.fallback import fallbacks, queue
-from sidecar.core.robot.fallback.fallbacks import Accepted, Fallbacks
-from sidecar.core.rules.service_rule import FallbackRule, ServiceRule
-from sidecar.core.seam.application import RequestFailed
+from plr.protos.model.ids import ServiceName
+from plr.sidecar.core.robot.fallback import fallbacks, queue
+from plr.sidecar.core.robot.fallback.fallbacks import Accepted, Fallbacks
+from plr.sidecar.core.rules.service_rule import FallbackRule, ServiceRule
+from plr.sidecar.core.seam.application import RequestFailed
 from tests.support.builders import request_id
 
 if TYPE_CHECKING:
-    from sidecar.core.base.values import RequestId
+    from plr.sidecar.core.base.values import RequestId
 
 PLAN, LOCAL = ServiceName("/plan"), ServiceName("/plan_locally")
 DEADLINE_S, LIFETIME_S = 1.0, 10.0
@@ -243,7 +243,7 @@ def test_the_queue_has_an_end() -> None:
 
 
 def test_payloads_are_not_kept_beyond_the_limit(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("sidecar.core.robot.fallback.fallbacks.MAX_HELD_BYTES", 2)
+    monkeypatch.setattr("plr.sidecar.core.robot.fallback.fallbacks.MAX_HELD_BYTES", 2)
     world = World()
     world.submit(1, 2, 3)
     assert world.counted() == {"overloaded": 1}

@@ -5,17 +5,17 @@ from dataclasses import replace
 
 import pytest
 
-from protos.convert import parse_sidecar_message, sidecar_message_to_proto
-from protos.model.ids import InterfaceName, NodeName, ServiceName
-from protos.model.mapping import Assignment
-from protos.model.report import MAX_PATHS, InterfaceJointReport, JointReport, OutcomeReport
-from sidecar.core.base.report_scope import ReportScope
-from sidecar.core.base.values import PathState
-from sidecar.core.robot.measure import measurements as measurements_module
-from sidecar.core.robot.measure.measurements import InterfacePair, Measurements, PairOutcome
-from sidecar.core.robot.request.request import Carried
-from sidecar.core.seam.links import PathMeasured
-from sidecar.core.transfer.routes import Routes
+from plr.protos.convert import parse_sidecar_message, sidecar_message_to_proto
+from plr.protos.model.ids import InterfaceName, NodeName, ServiceName
+from plr.protos.model.mapping import Assignment
+from plr.protos.model.report import MAX_PATHS, InterfaceJointReport, JointReport, OutcomeReport
+from plr.sidecar.core.base.report_scope import ReportScope
+from plr.sidecar.core.base.values import PathState
+from plr.sidecar.core.robot.measure import measurements as measurements_module
+from plr.sidecar.core.robot.measure.measurements import InterfacePair, Measurements, PairOutcome
+from plr.sidecar.core.robot.request.request import Carried
+from plr.sidecar.core.seam.links import PathMeasured
+from plr.sidecar.core.transfer.routes import Routes
 from tests.support.builders import ECHO, WLAN, WWAN, A, B, path
 
 ON_WLAN, ON_WWAN = Carried(WLAN, A, ECHO, 0), Carried(WWAN, A, ECHO, 3)

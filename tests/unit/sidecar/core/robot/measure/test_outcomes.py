@@ -7,17 +7,17 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from sidecar.core.robot.measure.measurements import Measurements
-from sidecar.core.robot.measure.outcomes import measure_outcomes
-from sidecar.core.robot.request.request import Copy, CopyState, Request
-from sidecar.core.rules.service_rule import ServiceRule
-from sidecar.core.transfer.routes import Routes
+from plr.sidecar.core.robot.measure.measurements import Measurements
+from plr.sidecar.core.robot.measure.outcomes import measure_outcomes
+from plr.sidecar.core.robot.request.request import Copy, CopyState, Request
+from plr.sidecar.core.rules.service_rule import ServiceRule
+from plr.sidecar.core.transfer.routes import Routes
 from tests.support.builders import ECHO, TYPE, WLAN, WWAN, A, B, path, request_id
 
 if TYPE_CHECKING:
-    from protos.model.report import Report
-    from sidecar.core.base.values import PathId
-    from sidecar.core.message.outbound import OutboundMessage
+    from plr.protos.model.report import Report
+    from plr.sidecar.core.base.values import PathId
+    from plr.sidecar.core.message.outbound import OutboundMessage
 
 ETH_A, WLAN_A, WWAN_A, WWAN_B = path("eth0", A), path(WLAN, A), path(WWAN, A), path(WWAN, B)
 NO_MESSAGE: OutboundMessage = None  # type: ignore[assignment]  # what is counted does not look at it

@@ -6,19 +6,19 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from protos.model.redundancy_mode import RedundancyMode
-from sidecar.core.base.request_id import OBSERVED_ONE_IN
-from sidecar.core.base.values import PathState
-from sidecar.core.robot.measure.outcomes import interface_outcomes
-from sidecar.core.robot.request.request import Copy, CopyState, Request
-from sidecar.core.rules.service_rule import ServiceRule
-from sidecar.core.transfer.routes import Routes
+from plr.protos.model.redundancy_mode import RedundancyMode
+from plr.sidecar.core.base.request_id import OBSERVED_ONE_IN
+from plr.sidecar.core.base.values import PathState
+from plr.sidecar.core.robot.measure.outcomes import interface_outcomes
+from plr.sidecar.core.robot.request.request import Copy, CopyState, Request
+from plr.sidecar.core.rules.service_rule import ServiceRule
+from plr.sidecar.core.transfer.routes import Routes
 from tests.support.builders import ECHO, TYPE, WLAN, WWAN, A, B, path, request_id
 
 if TYPE_CHECKING:
-    from protos.model.ids import InterfaceName
-    from sidecar.core.base.values import PathId
-    from sidecar.core.message.outbound import OutboundMessage
+    from plr.protos.model.ids import InterfaceName
+    from plr.sidecar.core.base.values import PathId
+    from plr.sidecar.core.message.outbound import OutboundMessage
 
 WLAN_A, WLAN_B, WWAN_A, WWAN_B, ETH_A = (path(*of) for of in ((WLAN, A), (WLAN, B), (WWAN, A), (WWAN, B), ("eth0", A)))
 NO_MESSAGE: OutboundMessage = None  # type: ignore[assignment]  # what is counted does not look at it

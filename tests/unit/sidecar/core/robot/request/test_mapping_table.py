@@ -1,10 +1,10 @@
 from __future__ import annotations
 
-from protos.model.ids import InterfaceName, NodeName, Version
-from protos.model.mapping import Assignment, MappingSet, ServiceMapping
-from sidecar.core.base.values import PathId, PathState
-from sidecar.core.robot.request.mapping_table import MappingTable
-from sidecar.core.transfer.routes import Routes
+from plr.protos.model.ids import InterfaceName, NodeName, Version
+from plr.protos.model.mapping import Assignment, MappingSet, ServiceMapping
+from plr.sidecar.core.base.values import PathId, PathState
+from plr.sidecar.core.robot.request.mapping_table import MappingTable
+from plr.sidecar.core.transfer.routes import Routes
 from tests.support.builders import ECHO, WLAN, WWAN, A, B, path
 
 WLAN_A, WLAN_B, WWAN_A, WWAN_B = path(WLAN, A), path(WLAN, B), path(WWAN, A), path(WWAN, B)

@@ -5,15 +5,15 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from protos.model.ids import ServiceName
-from protos.model.members import Peer, ServiceOffer
-from sidecar.core.base.values import PathState
-from sidecar.core.robot.request import service_catalog
-from sidecar.core.robot.request.service_catalog import MAX_OFFERED, WITHDRAW_AFTER_S, Offers
-from sidecar.core.rules.service_rule import Rules
-from sidecar.core.seam.application import OfferService, WithdrawService
-from sidecar.core.seam.stats import EngineStats
-from sidecar.core.transfer.routes import Routes
+from plr.protos.model.ids import ServiceName
+from plr.protos.model.members import Peer, ServiceOffer
+from plr.sidecar.core.base.values import PathState
+from plr.sidecar.core.robot.request import service_catalog
+from plr.sidecar.core.robot.request.service_catalog import MAX_OFFERED, WITHDRAW_AFTER_S, Offers
+from plr.sidecar.core.rules.service_rule import Rules
+from plr.sidecar.core.seam.application import OfferService, WithdrawService
+from plr.sidecar.core.seam.stats import EngineStats
+from plr.sidecar.core.transfer.routes import Routes
 from tests.support.builders import ECHO, TYPE, A, B, path, peer, rule
 
 if TYPE_CHECKING:
