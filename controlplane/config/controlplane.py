@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Annotated, Literal, Self
 
-from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, model_validator
+from pydantic import AfterValidator, BeforeValidator, ConfigDict, Field, model_validator
 
-from plr.controlplane.config.pattern_fields import InterfacePatterns, NodePatterns, one_or_list
+from plr.controlplane.config.pattern_fields import InterfacePatterns, NodePatterns, OneOrList
 from plr.controlplane.config.policy import PolicyConfig
+from plr.controlplane.config.section import Section
 from plr.controlplane.core.control.events import Settings
 from plr.controlplane.core.policy.path_rules import MAX_PATH_RULES, PathRule
 from plr.controlplane.core.problem.problem import Objective
@@ -35,108 +36,84 @@ def _empty_if_null(value: object) -> object:
     return {} if value is None else value
 
 
-class PathRuleConfig(BaseModel):
+class PathRuleConfig(Section):
     """Allows or denies requests over these interfaces of these robots to these clouds."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
+    robots: NodePatterns = ("*",)
+    """Names of robots."""
+    interfaces: InterfacePatterns = ("*",)
+    """Names of the robots' interfaces."""
+    clouds: NodePatterns = ("*",)
+    """Names of clouds."""
+    allow: bool
+    """Whether mappings may use these pairs."""
 
-    robots: NodePatterns = Field(default=("*",), description="Patterns of names of robots.")
-    interfaces: InterfacePatterns = Field(default=("*",), description="Patterns of names of the robots' interfaces.")
-    clouds: NodePatterns = Field(default=("*",), description="Patterns of names of clouds.")
-    allow: bool = Field(description="Whether mappings may use these pairs.")
 
-
-class ControlPlaneConfig(BaseModel):
+class ControlPlaneConfig(Section):
     """Keys of the YAML file. Times are milliseconds unless the key says seconds."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid", title="plr-controlplane")
+    model_config = ConfigDict(title="plr-controlplane")
 
-    listen: ListenAddress = Field(
-        default="[::]:50051", description="address:port of the gRPC server; port 0 takes a free one."
-    )
-    tls_dir: TlsDir | None = Field(
-        default=None,
-        description="Absolute path of the folder with cert.pem, key.pem, ca.pem and perhaps crl.pem, as plr ca issue "
-        "writes it; read anew when they change. Required unless insecure.",
-    )
-    insecure: bool = Field(
-        default=False,
-        description="true: no TLS, everybody is who they say. For trying out on one machine; refused with a listen "
-        "address that others reach, unless --insecure-i-know is on the command line.",
-    )
+    listen: ListenAddress = "[::]:50051"
+    """Where gRPC is served, for sidecars and `plr`. `[::]` means all addresses, IPv4 included; port 0 takes a free
+    one."""
+    tls_dir: TlsDir | None = None
+    """Required without `insecure`. Folder with `cert.pem`, `key.pem`, `ca.pem` and perhaps `crl.pem`, as
+    `plr ca issue NAME --role controlplane` writes it. It is checked four times a second: new files, above all a
+    revocation list, take effect without a restart."""
+    insecure: bool = False
+    """`true` in place of `tls_dir`: no TLS, and everybody is who they say. This is for trials on one machine: a
+    `listen` address that others reach is refused unless `--insecure-i-know` is on the command line."""
     stun_listen: Annotated[
-        tuple[ListenAddress, ...], BeforeValidator(one_or_list), AfterValidator(refuse_duplicates), Field(max_length=16)
-    ] = Field(
-        default=("[::]:3478",),
-        description="address:port or a list of them where STUN is answered; an empty list turns it off. "
-        "[::] means all addresses, IPv4 included.",
-    )
+        tuple[ListenAddress, ...], Field(max_length=16), OneOrList(), AfterValidator(refuse_duplicates)
+    ] = ("[::]:3478",)
+    """Where STUN is answered. An empty list turns it off."""
     stun_servers: Annotated[
-        tuple[RemoteAddress, ...], BeforeValidator(one_or_list), AfterValidator(refuse_duplicates), Field(max_length=16)
-    ] = Field(
-        default=(),
-        description="host:port of the STUN servers that sidecars are told to use, seen from the sidecars: "
-        "this one's public address, others, or both.",
-    )
-    metrics_listen: ListenAddress | None = Field(
-        default="127.0.0.1:9465", description="address:port for Prometheus; null turns it off."
-    )
-    state_dir: AbsolutePath | None = Field(
-        default=None,
-        description="Absolute path of a folder of its own, made if missing, for the log of events; null keeps these in "
-        "memory only, where a restart forgets who is gone.",
-    )
-    lease_ms: int = Field(
-        default=5000,
-        ge=500,
-        le=600_000,
-        description="A sidecar silent for this long leaves its peers' view. Ten reports long: a cellular "
-        "handover or a lost TCP segment takes seconds, and dead paths are noticed by the data plane much sooner.",
-    )
-    report_interval_ms: int = Field(
-        default=500,
-        ge=50,
-        le=60_000,
-        description="How often ten sidecars report what they measured; more of them less often, up to 10 s "
-        "apart. What cannot wait they report at once.",
-    )
-    warm_up_ms: int = Field(
-        default=RECONNECT_MAX_MS + 2000,
-        ge=0,
-        le=600_000,
-        description="After a start, robots that still hold peers are not sent a set that lacks some for at most "
-        f"this long: sidecars come back within {RECONNECT_MAX_MS} ms, and the time to register.",
-    )
-    histogram_half_life_s: float = Field(
-        default=60.0, ge=1.0, le=86_400.0, description="Age at which a latency sample counts half."
-    )
-    default_capacity_interfaces: int = Field(
-        default=1,
-        ge=0,
-        le=256,
-        description="How many interfaces of one robot may share a server for one service; 0 means no limit. The "
-        "paper's value is 1. Exceeded by the least amount where there are too few servers.",
-    )
-    objective: Objective = Field(
-        default=Objective.JOINT,
-        description="What the mapping minimises: the probability that all copies miss the deadline, with paths that "
-        "fail together (joint) or as if they never did (product), or the sum of the copies' miss probabilities "
-        "(sum, the paper's).",
-    )
-    solver_time_limit_ms: int = Field(
-        default=2000, ge=10, le=60_000, description="Longest time for one solving; then the best plan found is taken."
-    )
-    paths: tuple[PathRuleConfig, ...] = Field(
-        default=(),
-        max_length=MAX_PATH_RULES,
-        description="Which pairs of an interface and a cloud mappings may use: the first rule that matches decides, "
-        "and what none matches is allowed.",
-    )
-    policy: Annotated[PolicyConfig | None, BeforeValidator(_empty_if_null)] = Field(
-        default=None,
-        description="Access control. Without this key everything is allowed; with it, what no rule allows is denied.",
-    )
-    log_level: Literal["debug", "info", "warning", "error"] = Field(default="info", description="Least level logged.")
+        tuple[RemoteAddress, ...], Field(max_length=16), OneOrList(), AfterValidator(refuse_duplicates)
+    ] = ()
+    """STUN servers for the sidecars to ask, as seen from them: this host's public address, others, or both."""
+    metrics_listen: ListenAddress | None = "127.0.0.1:9465"
+    """Where Prometheus reads the metrics; `null` for none."""
+    state_dir: AbsolutePath | None = None
+    """Folder for the log of events, one for each control plane; it is made if missing. The folder, the folders above it
+    and links on the way must belong to root or the program's user. Without this key events are in memory only, and a
+    restart forgets who is gone. The shipped configuration sets `/var/lib/plr-controlplane`."""
+    lease_ms: Annotated[int, Field(ge=500, le=600_000)] = 5000
+    """A sidecar silent for this long leaves its peers' view. It is at least three `report_interval_ms`. With a shorter
+    one, dead servers are forgotten sooner; with a longer one, slow links are not mistaken for dead ones. The sidecars
+    themselves notice dead paths much sooner."""
+    report_interval_ms: Annotated[int, Field(ge=50, le=60_000)] = 500
+    """How often ten sidecars report what they measured. More sidecars report less often, by about the square root of
+    their number and up to 10 s apart: a thousand every 6.3 s. Their leases are at least three reports long. A changed
+    path or a missed deadline is reported at once."""
+    warm_up_ms: Annotated[int, Field(ge=0, le=600_000)] = RECONNECT_MAX_MS + 2000
+    """After a start, for at most this long, a robot that still holds peers is not sent a set that lacks some of its
+    servers: they may just not be back yet."""
+    histogram_half_life_s: Annotated[float, Field(ge=1.0, le=86_400.0)] = 60.0
+    """Half-life of latency samples, and of misses in the longest of the memories that predict. With a shorter one, the
+    mapping follows sooner and rests on fewer samples."""
+    default_capacity_interfaces: Annotated[int, Field(ge=0, le=256)] = 1
+    """How many interfaces of one robot may share a server for one service; `0` for no limit. 1 is the paper's value:
+    every interface has its own server. The limit is exceeded by the least amount where servers are too few."""
+    objective: Objective = Objective.JOINT
+    """What the mapping minimises.
+
+    - `joint`: the probability that all copies of a request miss the deadline, with paths that were seen to fail
+      together counted as such.
+    - `product`: the same as if paths failed independently.
+    - `sum`: the sum of the copies' miss probabilities, as in the paper. It looks at the bad paths first, and ignores
+      how bad all are together."""
+    solver_time_limit_ms: Annotated[int, Field(ge=10, le=60_000)] = 2000
+    """Longest time for one solve; then the incumbent is taken. An urgent solve, after paths died or came back, is
+    limited to 0.1 s, or to 0.25 ms for each service of a robot if that is longer. The next routine solve goes on."""
+    paths: Annotated[tuple[PathRuleConfig, ...], Field(max_length=MAX_PATH_RULES)] = ()
+    """Rules on which pairs of an interface and a cloud mappings may use. The first that matches decides; what none
+    matches is allowed. They are for planning, not for protection, which is the task of `policy`."""
+    policy: Annotated[PolicyConfig | None, BeforeValidator(_empty_if_null)] = None
+    """Access control. Without this key everything is allowed. With it, even with nothing after it, what no rule allows
+    is denied."""
+    log_level: Literal["debug", "info", "warning", "error"] = "info"
+    """Least level of what is logged to stderr."""
 
     @model_validator(mode="after")
     def _secured_or_not(self) -> Self:

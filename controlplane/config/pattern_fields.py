@@ -2,13 +2,20 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Annotated
 
-from pydantic import AfterValidator, BeforeValidator, Field
+from pydantic import AfterValidator, Field
+from pydantic_core import core_schema
 
 from plr.controlplane.core.policy.patterns import MAX_PATTERN_CHARACTERS, NameKind, can_match
 from plr.controlplane.core.policy.policy import MAX_PATTERNS
-from plr.protos.program.config_fields import refuse_duplicates
+from plr.protos.program.config_fields import refuse_duplicates, text_of
+
+if TYPE_CHECKING:
+    from pydantic import GetCoreSchemaHandler, GetJsonSchemaHandler
+    from pydantic.json_schema import JsonSchemaValue
+    from pydantic_core import CoreSchema
 
 _EXAMPLES = {
     NameKind.NODE: "a name of letters, digits, '_', '.' and '-', or a pattern such as arm-*",
@@ -17,8 +24,19 @@ _EXAMPLES = {
 }
 
 
-def one_or_list(value: object) -> object:
-    """Return a list of one for a single text, else the value itself."""
+@dataclass(frozen=True)
+class OneOrList:
+    """Takes a single text for a list of one."""
+
+    def __get_pydantic_core_schema__(self, source: object, handler: GetCoreSchemaHandler) -> CoreSchema:
+        return core_schema.no_info_before_validator_function(_as_list, handler(source))
+
+    def __get_pydantic_json_schema__(self, schema: CoreSchema, handler: GetJsonSchemaHandler) -> JsonSchemaValue:
+        several = handler(schema)
+        return {"anyOf": [several["items"], several]}
+
+
+def _as_list(value: object) -> object:
     return (value,) if isinstance(value, str) else value
 
 
@@ -30,10 +48,11 @@ def _check(pattern: str, kind: NameKind) -> str:
     return pattern
 
 
-_NodePattern = Annotated[str, AfterValidator(lambda pattern: _check(pattern, NameKind.NODE))]
-_ServicePattern = Annotated[str, AfterValidator(lambda pattern: _check(pattern, NameKind.SERVICE))]
-_InterfacePattern = Annotated[str, AfterValidator(lambda pattern: _check(pattern, NameKind.INTERFACE))]
-_List = (BeforeValidator(one_or_list), AfterValidator(refuse_duplicates), Field(min_length=1, max_length=MAX_PATTERNS))
+_PATTERN = text_of("pattern")
+_NodePattern = Annotated[str, AfterValidator(lambda pattern: _check(pattern, NameKind.NODE)), _PATTERN]
+_ServicePattern = Annotated[str, AfterValidator(lambda pattern: _check(pattern, NameKind.SERVICE)), _PATTERN]
+_InterfacePattern = Annotated[str, AfterValidator(lambda pattern: _check(pattern, NameKind.INTERFACE)), _PATTERN]
+_List = (Field(min_length=1, max_length=MAX_PATTERNS), OneOrList(), AfterValidator(refuse_duplicates))
 NodePatterns = Annotated[tuple[_NodePattern, ...], *_List]
 ServicePatterns = Annotated[tuple[_ServicePattern, ...], *_List]
 InterfacePatterns = Annotated[tuple[_InterfacePattern, ...], *_List]

@@ -2,42 +2,42 @@
 
 from __future__ import annotations
 
-from pydantic import BaseModel, ConfigDict, Field
+from typing import Annotated
+
+from pydantic import Field
 
 from plr.controlplane.config.pattern_fields import NodePatterns, ServicePatterns
+from plr.controlplane.config.section import Section
 from plr.controlplane.core.policy.policy import MAX_RULES, CallRule, OfferRule, Policy
 
 
-class CallRuleConfig(BaseModel):
+class CallRuleConfig(Section):
     """These robots may call these services on these clouds."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
+    robots: NodePatterns
+    """Names of robots."""
+    services: ServicePatterns
+    """Full names of services."""
+    clouds: NodePatterns
+    """Names of clouds."""
 
-    robots: NodePatterns = Field(description="Patterns of names of robots.")
-    services: ServicePatterns = Field(description="Patterns of full names of services.")
-    clouds: NodePatterns = Field(description="Patterns of names of clouds.")
 
-
-class OfferRuleConfig(BaseModel):
+class OfferRuleConfig(Section):
     """These clouds may offer these services."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
+    clouds: NodePatterns
+    """Names of clouds."""
+    services: ServicePatterns
+    """Full names of services."""
 
-    clouds: NodePatterns = Field(description="Patterns of names of clouds.")
-    services: ServicePatterns = Field(description="Patterns of full names of services.")
 
-
-class PolicyConfig(BaseModel):
+class PolicyConfig(Section):
     """What is allowed; everything else is denied."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-    calls: tuple[CallRuleConfig, ...] = Field(
-        default=(), max_length=MAX_RULES, description="Which robots may call which services on which clouds."
-    )
-    offers: tuple[OfferRuleConfig, ...] = Field(
-        default=(), max_length=MAX_RULES, description="Which clouds may offer which services."
-    )
+    calls: Annotated[tuple[CallRuleConfig, ...], Field(max_length=MAX_RULES)] = ()
+    """Rules: which robots may call which services on which clouds."""
+    offers: Annotated[tuple[OfferRuleConfig, ...], Field(max_length=MAX_RULES)] = ()
+    """Rules: which clouds may offer which services."""
 
     def policy(self) -> Policy:
         """Return the core's rules."""

@@ -6,7 +6,7 @@ import os
 from pathlib import Path
 from typing import Annotated
 
-from pydantic import AfterValidator, BeforeValidator
+from pydantic import AfterValidator, BeforeValidator, WithJsonSchema
 
 from plr.protos.base.host_port import canonical_ip, check_remote, split_host_port
 
@@ -59,17 +59,27 @@ def _refuse_port_alone(value: object) -> object:
     return value
 
 
-AbsolutePath = Annotated[Path, AfterValidator(check_absolute)]
+def text_of(kind: str) -> WithJsonSchema:
+    """Describe a text in the JSON Schema by what it has to be, as its `format`."""
+    return WithJsonSchema({"type": "string", "format": kind})
+
+
+REMOTE_ADDRESS = {"type": "string", "format": "host:port"}
+"""JSON Schema of an address to connect to."""
+
+AbsolutePath = Annotated[Path, AfterValidator(check_absolute), text_of("absolute path")]
 """A folder; for a service, a relative path would be ambiguous."""
 
 TlsDir = AbsolutePath
 """Folder of a node's certificate files."""
 
-RemoteAddress = Annotated[str, AfterValidator(check_remote)]
+RemoteAddress = Annotated[str, AfterValidator(check_remote), WithJsonSchema(REMOTE_ADDRESS)]
 """host:port to connect to."""
 
-ListenAddress = Annotated[str, BeforeValidator(_refuse_port_alone), AfterValidator(_check_listen)]
+ListenAddress = Annotated[
+    str, BeforeValidator(_refuse_port_alone), AfterValidator(_check_listen), text_of("address:port")
+]
 """address:port to listen on, port 0 for any free one."""
 
-IpAddress = Annotated[str, AfterValidator(canonical_ip)]
+IpAddress = Annotated[str, AfterValidator(canonical_ip), text_of("IP address")]
 """IPv4 or IPv6 in canonical form."""

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import re
-from typing import Annotated
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Annotated
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, PlainValidator, WithJsonSchema
 
@@ -12,7 +13,16 @@ from plr.protos.base.host_port import check_remote
 from plr.protos.convert.fields import MAX_COPIES
 from plr.protos.model.members import AT_MOST_EVERY_INTERFACE, EVERY_INTERFACE, Copies
 from plr.protos.model.names import domain_label, node_name
-from plr.protos.program.config_fields import encoded_path, refuse_duplicates
+from plr.protos.program.config_fields import REMOTE_ADDRESS, encoded_path, refuse_duplicates, text_of
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from pydantic import GetJsonSchemaHandler
+    from pydantic.json_schema import JsonSchemaValue
+    from pydantic_core import CoreSchema
+
+    from plr.protos.model.ids import Role
 
 _INTERFACE = re.compile(r"[!-.0-~]{1,15}")
 _INTERFACE_GLOB = re.compile(r"[!-.0-~]{1,64}")
@@ -120,12 +130,38 @@ class Section(BaseModel):
         extra="forbid", frozen=True, strict=True, allow_inf_nan=False, use_attribute_docstrings=True
     )
 
+    def misplaced(self, role: Role) -> Iterator[tuple[str, str]]:
+        """Yield each key of the other role that has a value, and why it has no place here."""
+        for key, field in type(self).model_fields.items():
+            for mark in field.metadata:
+                if isinstance(mark, OnlyOn) and mark.role is not role and key in self.model_fields_set:
+                    if getattr(self, key) not in (None, ()):
+                        yield key, f"expected on a {mark.role.value} only: {mark.why}"
 
-SidecarName = Annotated[str, AfterValidator(_check_node_name)]
-InterfacePattern = Annotated[str, AfterValidator(_check_interface)]
-ServicePattern = Annotated[str, AfterValidator(_check_service)]
-ServiceType = Annotated[str, AfterValidator(_check_service_type)]
-FullServiceName = Annotated[str, AfterValidator(_check_service_name)]
+
+@dataclass(frozen=True)
+class OnlyOn:
+    """Marks a key that has an effect in one role only."""
+
+    role: Role
+    why: str
+
+    def __get_pydantic_json_schema__(self, schema: CoreSchema, handler: GetJsonSchemaHandler) -> JsonSchemaValue:
+        return {**handler(schema), ROLE_IN_SCHEMA: self.role.value}
+
+
+ROLE_IN_SCHEMA = "x-role"
+"""Keyword of the JSON Schema for the only role in which a key has an effect."""
+
+_LABEL = "1 to 63 letters, digits, `-`, `_`, `.`, `&`, `+`"
+
+SidecarName = Annotated[
+    str, AfterValidator(_check_node_name), text_of("1 to 63 letters, digits, `-`, `_`, `.`, a letter or digit first")
+]
+InterfacePattern = Annotated[str, AfterValidator(_check_interface), text_of("name or glob")]
+ServicePattern = Annotated[str, AfterValidator(_check_service), text_of("full name or glob")]
+ServiceType = Annotated[str, AfterValidator(_check_service_type), text_of("name of a type")]
+FullServiceName = Annotated[str, AfterValidator(_check_service_name), text_of("full name")]
 RepairShare = Annotated[
     float | str,
     PlainValidator(_check_repair_share),
@@ -137,15 +173,19 @@ ControlPlaneAddresses = Annotated[
     WithJsonSchema(
         {
             "anyOf": [
-                {"type": "string"},
-                {"type": "array", "items": {"type": "string"}, "minItems": 1, "maxItems": MAX_CONTROL_PLANES},
+                REMOTE_ADDRESS,
+                {"type": "array", "items": REMOTE_ADDRESS, "minItems": 1, "maxItems": MAX_CONTROL_PLANES},
             ]
         }
     ),
 ]
-DomainLabel = Annotated[str, Field(min_length=1), AfterValidator(_check_domain_label)]
+DomainLabel = Annotated[str, Field(min_length=1), AfterValidator(_check_domain_label), text_of(_LABEL)]
 """Name of a region or a carrier."""
-LocalSocket = Annotated[str, AfterValidator(_check_local_socket)]
+LocalSocket = Annotated[
+    str,
+    AfterValidator(_check_local_socket),
+    WithJsonSchema({"anyOf": [{"enum": ["auto"]}, {"type": "string", "format": "absolute path"}]}),
+]
 CopiesWanted = Annotated[
     Copies,
     PlainValidator(_check_copies),

@@ -5,7 +5,7 @@ from __future__ import annotations
 import enum
 from typing import TYPE_CHECKING, Annotated
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from plr.protos.convert.fields import MAX_CHARGE
 from plr.protos.model.ids import Role, ServiceName
@@ -16,6 +16,7 @@ from plr.sidecar.config.fields import (
     DomainLabel,
     FullServiceName,
     InterfacePattern,
+    OnlyOn,
     RepairShare,
     Section,
     ServicePattern,
@@ -65,22 +66,7 @@ _MS_PER_S = 1000.0
 _MAX_LIFETIME_MS = MAX_LIFETIME_S * _MS_PER_S
 
 
-_ROBOTS_KEYS = (
-    "type",
-    "deadline_ms",
-    "idempotent",
-    "drop_late",
-    "priority",
-    "exploration",
-    "redundancy",
-    "hedge_quantile",
-    "copies",
-    "mode",
-    "target_miss",
-    "fallback",
-    "fallback_start",
-    "fallback_takes_ms",
-)
+_ROBOT = OnlyOn(Role.ROBOT, "it is the robot's sidecar that decides this")
 
 
 class PriorityWord(enum.Enum):
@@ -106,18 +92,21 @@ class FallbackStart(enum.Enum):
 
 
 class NetworkConfig(Section):
-    """What lies behind interfaces; the first entry that matches an interface's name decides."""
+    """The network behind interfaces."""
 
     interface: InterfacePattern
-    """Name or glob."""
+    """Name or glob of interfaces. Each is written once."""
     carrier: DomainLabel | None = None
-    """Whose network it is: interfaces with the same carrier are taken to fail together."""
+    """Name of the network's operator. Interfaces with the same carrier are assumed to fail together."""
     cost_per_request: Annotated[float, Field(ge=0, le=MAX_CHARGE)] = DEFAULT_CHARGE
-    """What a copy of a request over it costs, in any one currency; for services with mode cheapest."""
-    extra_load: Annotated[float, Field(ge=0, le=MAX_EXTRA_LOAD)] | None = None
-    """Bytes of extra copies over it for each byte of requests answered in time; none: no limit."""
-    extra_mb_per_day: Annotated[float, Field(ge=0, le=MAX_EXTRA_MB_PER_DAY)] | None = None
-    """Megabytes (10^6 bytes) of extra copies over it in 24 hours; none: no limit."""
+    """Cost of a copy of a request over it, in any one currency. It counts for services with `mode: cheapest`. The
+    control stream prefers what costs less, too."""
+    extra_load: Annotated[float | None, Field(ge=0, le=MAX_EXTRA_LOAD)] = None
+    """Extra copies over it may weigh this share of all requests answered in time. Each interface that the name matches
+    has a budget of its own. `0` allows no extra copy. Without this key there is no such limit."""
+    extra_mb_per_day: Annotated[float | None, Field(ge=0, le=MAX_EXTRA_MB_PER_DAY)] = None
+    """Extra copies over it may weigh this much in 24 hours. The control stream takes such an interface only while no
+    other leads to the control plane. Without this key there is no such limit."""
 
     def budget(self) -> Budget:
         """Return the budget in the form that the cores use."""
@@ -126,60 +115,112 @@ class NetworkConfig(Section):
 
 
 class ServiceConfig(Section):
-    """One service, or all whose name matches a glob; the first entry that matches a name decides."""
+    """One service, or all services whose name matches a glob."""
 
     name: ServicePattern
-    """Full name such as /plan_path, or a glob such as /arm/*."""
-    type: ServiceType | None = None
-    """Robot: its type, such as nav_msgs/srv/GetPlan: servers that offer it with another get no requests. Default: the
-    type of most servers."""
-    deadline_ms: Annotated[float, Field(gt=0, le=MAX_DEADLINE_MS)] | None = None
-    """Robot, required: an answer is in time within this many milliseconds."""
-    lifetime_ms: Annotated[float, Field(gt=0, le=_MAX_LIFETIME_MS)] | None = None
-    """Milliseconds after which an unanswered request is given up; more than deadline_ms.
+    """Full name such as `/plan_path`, or a glob such as `/arm/*`. Each name is written once. A full name comes before a
+    glob that matches it."""
+    type: Annotated[ServiceType | None, _ROBOT] = None
+    """Type of the service, such as `nav_msgs/srv/GetPlan`. Servers that offer the service with another type get no
+    requests, however many they are. Without this key the type of most servers counts."""
+    deadline_ms: Annotated[float | None, Field(gt=0, le=MAX_DEADLINE_MS), _ROBOT] = None
+    """Required. An answer is in time within this many milliseconds. Nothing ends at the deadline."""
+    lifetime_ms: Annotated[float | None, Field(gt=0, le=_MAX_LIFETIME_MS)] = None
+    """How long an unanswered request lives.
 
-    Robot: by default 10 deadlines, at least 30000 (10000 with drop_late) and at most 300000. Cloud: how long a local
-    server is waited for, by default 60000."""
-    idempotent: bool | None = None
-    """Robot: copies of one request may run on several servers. Default false."""
-    drop_late: bool | None = None
-    """Robot: an answer after the deadline is not delivered. Default false."""
-    priority: Annotated[PriorityWord | None, converted] = None
-    """Robot: low, normal or high; what is higher never waits for what is lower. Default normal."""
-    fec: RepairShare | None = None
-    """Repair symbols for each symbol of what is sent from here (robot: requests, cloud: answers), 0 to 1, or off, or
-    auto: as many as the loss measured on the path asks for. Default auto."""
-    redundancy: Annotated[RedundancyMode | None, converted] = None
-    """Robot: which of the mapped pairs carry a copy: single (the best), backup (the next one too, when the best is in
-    trouble), hedge (the next one too, when the answer takes long), adaptive (further ones, as late as target_miss
-    allows) or replicate (all). Default replicate."""
-    hedge_quantile: Annotated[float, Field(ge=MIN_HEDGE_QUANTILE, le=MAX_HEDGE_QUANTILE)] | None = None
-    """Robot, with redundancy hedge: the next copy is sent when the answer takes longer than this share of the answers
-    did. Default 0.95."""
-    copies: CopiesWanted | None = None
-    """Robot: over how many interfaces copies of a request are sent: each, at_most (each, but rather none than one too
-    many for a server or into a failure domain already used), or a number. Default each; with mode cheapest at_most."""
-    mode: Annotated[ModeWord | None, converted] = None
-    """Robot: most_reliable or cheapest, as long as target_miss is kept. Default most_reliable."""
-    target_miss: Annotated[float, Field(gt=0, lt=1)] | None = None
-    """Robot, with mode cheapest or redundancy adaptive: the largest predicted probability that a request misses its
-    deadline. With mode cheapest required, with redundancy adaptive alone 0.001 by default."""
-    exploration: Annotated[float, Field(ge=0, le=MAX_EXPLORATION)] | None = None
-    """Robot: share of the requests that may get one more copy over a path that the mapping does not use, to learn how
-    good it is; idempotent services only. Default 0.01, at most 0.1."""
-    fallback: FullServiceName | None = None
-    """Robot: a service of the same type, served by a node on this robot, that answers when the network does not;
-    idempotent services only."""
-    fallback_start: Annotated[FallbackStart | None, converted] = None
-    """Robot, with fallback: in_time (early enough to answer by the deadline) or on_miss (when the network has missed
-    the deadline). Default in_time."""
-    fallback_takes_ms: Annotated[float, Field(gt=0, le=MAX_DEADLINE_MS)] | None = None
-    """Robot, with fallback_start in_time: milliseconds that the fallback takes for a request at most. Default: as
-    measured."""
-    capacity_interfaces: Annotated[int, Field(ge=1, le=1_000_000)] | None = None
-    """Cloud: how many robot interfaces may be mapped to this server for the service; none: no limit."""
-    cost_per_request: Annotated[float, Field(ge=0, le=MAX_CHARGE)] | None = None
-    """Cloud: what a request costs that runs here, in the currency of the robots' networks. Default 0."""
+    Robot: an unanswered request is given up after this time, which is longer than `deadline_ms`. The default is 10
+    deadlines, at least 30000 (10000 with `drop_late`) and at most 300000. A service without a path or a server stays
+    offered for the same time, 15 s at least. Then it is withdrawn, and waiting requests are given up.
+
+    Cloud: a local server that does not answer is given up after this time, and the robot is notified, even if the robot
+    would wait longer. The default is 60000."""
+    idempotent: Annotated[bool, _ROBOT] = False
+    """Whether copies of one request may run on several servers.
+
+    - `true`: they may. If only one server was asked, has the request and is silent at half the deadline, another server
+      is asked (not with `redundancy: single`).
+    - `false`: one server at a time gets the request, over every interface that reaches it."""
+    drop_late: Annotated[bool, _ROBOT] = False
+    """`true`: an answer after the deadline is not delivered, so the application gets none."""
+    fec: RepairShare = "auto"
+    """Repair symbols for each symbol sent from here (robot: requests, cloud: answers). With them, lost datagrams cost
+    no round trip.
+
+    - `auto` adds nothing while no loss is measured. It adds about 11 % to a message of 150 kB at 2 % loss, 17 % at 5 %,
+      and at most half.
+    - `off` adds nothing; what is lost is sent again.
+
+    From 0.5 % loss on, some datagrams are sent twice, also with `off`: those that no repair symbol covers and whose
+    further loss would cost another round trip. These are a message's last datagram (all of a one-datagram message) and
+    the few that are sent again."""
+    priority: Annotated[PriorityWord, converted, _ROBOT] = PriorityWord.NORMAL
+    """Requests and answers of a service with a higher priority go before those of a lower one: on the robot's paths, on
+    the way back and in the server's queue. Use `high` for small and urgent requests, `low` for bulk that may wait."""
+    redundancy: Annotated[RedundancyMode, converted, _ROBOT] = RedundancyMode.REPLICATE
+    """Which of the mapped pairs of interface and server carry a copy.
+
+    - `single`: the best pair.
+    - `backup`: also the next one, as soon as the best one's path is unstable or down, or loses the request.
+    - `hedge`: also the next one when the answer takes long; idempotent services only.
+    - `adaptive`: others as well, as late as `target_miss` allows given the progress of the first copy; idempotent
+      services only.
+    - `replicate`: all at once; `copies` says how many are mapped."""
+    hedge_quantile: Annotated[float, Field(ge=MIN_HEDGE_QUANTILE, le=MAX_HEDGE_QUANTILE), _ROBOT] = (
+        DEFAULT_HEDGE_QUANTILE
+    )
+    """With `redundancy: hedge` only. The next copy is sent when the answer takes longer than this share of the recent
+    answers over that pair, at half the deadline at the latest."""
+    copies: Annotated[CopiesWanted | None, _ROBOT] = None
+    """Over how many interfaces the control plane maps copies of a request.
+
+    - `each`: over all. This is the default.
+    - `at_most`: over all, but over none rather than one too many for a server, or one into a region or behind a carrier
+      that has one already. This is the default with `mode: cheapest`.
+    - A number: over that many, the best ones."""
+    mode: Annotated[ModeWord, converted, _ROBOT] = ModeWord.MOST_RELIABLE
+    """Aim of the mapping.
+
+    - `most_reliable`: to miss as few deadlines as possible.
+    - `cheapest`: to cost as little as possible while `target_miss` is kept."""
+    target_miss: Annotated[float | None, Field(gt=0, lt=1), _ROBOT] = None
+    """The largest predicted probability that a request misses its deadline. The key needs `mode: cheapest` or
+    `redundancy: adaptive`.
+
+    - With `mode: cheapest` the mapping keeps it. The key is required.
+    - With `redundancy: adaptive` the moment at which further copies are sent keeps it. The default is 0.001."""
+    exploration: Annotated[float, Field(ge=0, le=MAX_EXPLORATION), _ROBOT] = DEFAULT_EXPLORATION
+    """At most this share of the requests gets one more copy, over a pair of interface and server about which too little
+    is known: `redundancy` or a budget leaves that pair out, or (idempotent services) the mapping does not use it. There
+    are at most 12 such copies a minute, none of requests beyond 128 KiB or over a busy interface. `0` turns this off.
+    Only idempotent services may set another value."""
+    fallback: Annotated[FullServiceName | None, _ROBOT] = None
+    """Full name of a service of the same type, served by a node on this robot, that answers when the network does not.
+    The first answer wins. The key needs the full name of one service with `idempotent: true`. A fallback is never
+    carried itself, whatever glob matches it."""
+    fallback_start: Annotated[FallbackStart, converted, _ROBOT] = FallbackStart.IN_TIME
+    """When the fallback is asked. Both values: at once when the network has refused.
+
+    - `in_time`: early enough to answer by the deadline, and at once while no path is up.
+    - `on_miss`: when the network has missed the deadline."""
+    fallback_takes_ms: Annotated[float | None, Field(gt=0, le=MAX_DEADLINE_MS), _ROBOT] = None
+    """With `fallback_start: in_time` only. The longest time that the fallback takes for a request, less than 95 % of
+    `deadline_ms`. Without this key the sidecar measures it."""
+    capacity_interfaces: Annotated[
+        int | None, Field(ge=1, le=1_000_000), OnlyOn(Role.CLOUD, "it limits what that server takes")
+    ] = None
+    """How many interfaces of all robots together the control plane may map to this server for the service. The limit is
+    exceeded, and reported, when there is no other way. Without this key there is none."""
+    cost_per_request: Annotated[
+        float, Field(ge=0, le=MAX_CHARGE), OnlyOn(Role.CLOUD, "a robot's costs are its networks'")
+    ] = 0.0
+    """Cost of a request that this server runs, in the currency of the robots' networks. It counts for robots' services
+    with `mode: cheapest`."""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _without_nulls(cls, data: object) -> object:
+        # A key with nothing after it is as good as left out.
+        return {key: value for key, value in data.items() if value is not None} if isinstance(data, dict) else data
 
     def rule(self, role: Role) -> ServiceRule:
         """Return the rule in the form that the cores use."""
@@ -196,20 +237,20 @@ class ServiceConfig(Section):
             pattern=self.name,
             deadline_s=deadline_ms / _MS_PER_S,
             lifetime_s=lifetime_ms / _MS_PER_S,
-            idempotent=bool(self.idempotent),
+            idempotent=self.idempotent,
             type=self.type or "",
-            drop_late=bool(self.drop_late),
-            priority=Priority[(self.priority or PriorityWord.NORMAL).name],
+            drop_late=self.drop_late,
+            priority=Priority[self.priority.name],
             fec=_redundancy(self.fec),
-            exploration=DEFAULT_EXPLORATION if self.exploration is None else self.exploration,
+            exploration=self.exploration,
             capacity=self.capacity_interfaces or _UNLIMITED,
-            redundancy=self.redundancy or RedundancyMode.REPLICATE,
-            hedge_quantile=self.hedge_quantile or DEFAULT_HEDGE_QUANTILE,
+            redundancy=self.redundancy,
+            hedge_quantile=self.hedge_quantile,
             adaptive_target=self.target_miss or DEFAULT_ADAPTIVE_TARGET,
             copies=self.copies or (AT_MOST_EVERY_INTERFACE if cheapest else EVERY_INTERFACE),
             target_miss=(self.target_miss or 0.0) if cheapest else 0.0,
             wanted_miss=self.target_miss or 0.0,
-            charge=self.cost_per_request or 0.0,
+            charge=self.cost_per_request,
             fallback=self._fallback_rule(),
         )
 
@@ -222,26 +263,20 @@ class ServiceConfig(Section):
 
     def problems(self, role: Role) -> Iterator[tuple[str, str]]:
         """Yield each key that is wrong in this role or beside other keys, and why."""
+        yield from self.misplaced(role)
         if role is Role.CLOUD:
-            for key in _ROBOTS_KEYS:
-                if getattr(self, key) is not None:
-                    yield key, "expected on a robot only: it is the robot's sidecar that decides this"
             return
-        if self.capacity_interfaces is not None:
-            yield "capacity_interfaces", "expected on a cloud only: it limits what that server takes"
-        if self.cost_per_request is not None:
-            yield "cost_per_request", "expected on a cloud only: a robot's costs are its networks'"
         if self.mode is ModeWord.CHEAPEST and self.target_miss is None:
             yield "target_miss", "expected a probability beside mode: cheapest, but missing"
         adaptive = self.redundancy is RedundancyMode.ADAPTIVE
         if self.mode is not ModeWord.CHEAPEST and not adaptive and self.target_miss is not None:
             yield "target_miss", "expected only beside mode: cheapest or redundancy: adaptive"
-        if self.redundancy is not None and self.redundancy.sends_late and not self.idempotent:
+        if self.redundancy.sends_late and not self.idempotent:
             word = self.redundancy.value
             yield "redundancy", f"expected {word} beside idempotent: true only, as copies run on several servers"
-        if self.redundancy is not RedundancyMode.HEDGE and self.hedge_quantile is not None:
+        if self.redundancy is not RedundancyMode.HEDGE and "hedge_quantile" in self.model_fields_set:
             yield "hedge_quantile", "expected only beside redundancy: hedge"
-        if self.exploration and not self.idempotent:
+        if "exploration" in self.model_fields_set and self.exploration and not self.idempotent:
             yield "exploration", "expected beside idempotent: true, as copies would run on several servers"
         yield from self._fallback_problems()
         if self.deadline_ms is None:
@@ -255,7 +290,7 @@ class ServiceConfig(Section):
     def _fallback_problems(self) -> Iterator[tuple[str, str]]:
         if self.fallback is None:
             for key in ("fallback_start", "fallback_takes_ms"):
-                if getattr(self, key) is not None:
+                if key in self.model_fields_set:
                     yield key, "expected only beside fallback"
             return
         if is_glob(self.name):
@@ -272,7 +307,7 @@ class ServiceConfig(Section):
             yield "fallback_takes_ms", f"expected less than {most:g}, else it can not answer by deadline_ms"
 
 
-def _redundancy(fec: float | str | None) -> Redundancy:
+def _redundancy(fec: float | str) -> Redundancy:
     if fec == "off":
         return 0.0
     return None if isinstance(fec, str) else fec

@@ -23,14 +23,17 @@ from plr.protos.program.config_fields import (
     check_absolute,
     check_security,
     refuse_duplicates,
+    text_of,
 )
 from plr.protos.program.config_file import key_path, parse_yaml, read_text, validate
 from plr.protos.trust.identity import IdentityRole
 from plr.sidecar.config.fields import (
+    ROLE_IN_SCHEMA,
     ControlPlaneAddresses,
     DomainLabel,
     InterfacePattern,
     LocalSocket,
+    OnlyOn,
     Section,
     SidecarName,
     converted,
@@ -64,9 +67,10 @@ class StunConfig(Section):
     """How the sidecar learns its addresses as seen from outside."""
 
     enabled: bool = True
-    """Off only where no NAT lies between the sidecars, such as clouds with public addresses."""
+    """Turn it off only where no NAT lies between the sidecars, such as clouds with public addresses."""
     servers: Annotated[tuple[RemoteAddress, ...], AfterValidator(refuse_duplicates), converted] = ()
-    """host:port of each server; none: those that the control plane names."""
+    """STUN servers to ask. An empty list: those named by the control plane, else port 3478 of the control plane's
+    host."""
 
     @model_validator(mode="after")
     def _check(self) -> Self:
@@ -79,60 +83,82 @@ class AdvertisedAddress(Section):
     """A public address that a 1:1 NAT translates to one interface of a cloud."""
 
     address: IpAddress
-    """IPv4 or IPv6, without port: the NAT keeps udp_port."""
-    interface: InterfacePattern | None = None
-    """The interface behind it; none: the first usable one."""
+    """IPv4 or IPv6 without port: the NAT must keep `udp_port`."""
+    interface: Annotated[InterfacePattern, text_of("name")] | None = None
+    """Name of the interface behind that address. Without this key it is the first usable one."""
 
 
 class SidecarConfig(Section):
     """Configuration of plr-sidecar."""
 
     name: SidecarName
-    """Name of this sidecar, unique in the mesh. With tls_dir the certificate's, and may be left out."""
+    """Name of this sidecar, unique in the mesh. With `tls_dir` the certificate contains it, and it may be left out
+    here. The control plane refuses a second holder. Labels of metrics and `plr status` show it."""
     role: Annotated[Role, converted]
-    """robot: its applications call services; cloud: its servers answer them. With tls_dir the certificate's, and may
-    be left out."""
+    """What this host does. With `tls_dir` the certificate contains it, and it may be left out here.
+
+    - `robot`: its applications call services.
+    - `cloud`: its servers answer them."""
     control_plane: ControlPlaneAddresses
-    """host:port of the control plane, or a list of its addresses, the preferred one first."""
+    """Where the control plane listens for gRPC. IPv6 is written in brackets. Every address is tried over every
+    interface in use, and the first that answers is taken. An IP address needs no name server, which may lie behind a
+    dark carrier."""
     tls_dir: Annotated[TlsDir, converted] | None = None
-    """Absolute path of the folder with cert.pem, key.pem, ca.pem and perhaps crl.pem, as plr ca issue writes it; read
-    anew when they change. Required unless insecure."""
+    """Required without `insecure`. Folder with `cert.pem`, `key.pem`, `ca.pem` and perhaps `crl.pem`, as
+    `plr ca issue NAME --role robot` (or `cloud`) writes it. It is checked once a second: with a new certificate the
+    sidecar opens a new stream, and requests go on meanwhile."""
     insecure: bool = False
-    """true: everybody is who they say. For trying out on one machine; refused with a control_plane elsewhere, unless
-    --insecure-i-know is on the command line."""
+    """`true` in place of `tls_dir`: everybody is who they say, and anyone in between may read and change the traffic.
+    This is for trials on one machine: a `control_plane` on another host is refused unless `--insecure-i-know` is on the
+    command line."""
     services: Annotated[tuple[ServiceConfig, ...], Field(min_length=1), converted]
-    """What is carried; nothing else is."""
+    """What is carried, and nothing else. The first entry that matches a name decides."""
     interfaces: (
         Annotated[tuple[InterfacePattern, ...], Field(min_length=1), AfterValidator(refuse_duplicates), converted]
         | None
     ) = None
-    """Names or globs; none: all usable ones, which leaves out loopback, containers, bridges and tunnels."""
-    networks: Annotated[tuple[NetworkConfig, ...], converted] = ()
-    """Robot: carriers and costs of its interfaces."""
-    region: DomainLabel | None = None
-    """Cloud: where it stands: clouds in the same region are taken to fail together."""
+    """Interfaces to use. Without this key: every ordinary interface that is up and has a carrier and an address.
+    Loopback, containers, bridges, VPNs and tunnels are used only under their exact name, never by a glob. An exact name
+    that does not exist causes a warning; the interface is used as soon as it comes."""
+    networks: Annotated[
+        tuple[NetworkConfig, ...],
+        converted,
+        OnlyOn(Role.ROBOT, "it is the robots' interfaces that are chosen between"),
+    ] = ()
+    """The networks behind the interfaces. The first entry that matches a name decides."""
+    region: Annotated[DomainLabel | None, OnlyOn(Role.CLOUD, "a robot's copies should go to different regions")] = None
+    """Where the cloud is. Copies of a request go to different regions where possible: clouds in the same region are
+    assumed to fail together."""
     udp_port: Annotated[int, Field(ge=0, le=65535)] = Field(
         default_factory=lambda fields: DEFAULT_CLOUD_UDP_PORT if fields.get("role") is Role.CLOUD else 0
     )
-    """Port of the data sockets, 0 for any free one. Default: 0 on a robot, 24700 on a cloud."""
-    advertise: Annotated[tuple[AdvertisedAddress, ...], converted] = ()
-    """Cloud behind a 1:1 NAT: its public addresses."""
+    """Port of the data sockets, the same on every interface. `0` takes a free one. The default is 0 on a robot, 24700
+    on a cloud."""
+    advertise: Annotated[
+        tuple[AdvertisedAddress, ...], converted, OnlyOn(Role.CLOUD, "a robot's addresses come from STUN")
+    ] = ()
+    """Public addresses of a 1:1 NAT in front of this host. They need a fixed `udp_port`."""
     stun: StunConfig = StunConfig()
     """How the sidecar learns its addresses as seen from outside."""
     state_dir: Annotated[AbsolutePath, converted] = Path("/var/lib/plr")
-    """Absolute path of the folder for the identity and the last good mapping."""
-    max_revocation_age_s: Annotated[int, Field(ge=60, le=365 * 86_400)] | None = None
-    """Seconds: peers whose CA signed no revocation list in this time, as far as is known here, are not talked to; null:
-    a list does not age."""
+    """Folder for the sidecar's identity and the last good peers and mapping. Each sidecar has its own; it is made if
+    missing. The folder, the folders above it and links on the way must belong to root or the sidecar's user. If the
+    folder is lost, the sidecar cannot start without a control plane, and cannot have its name until the old lease
+    ends."""
+    max_revocation_age_s: Annotated[int | None, Field(ge=60, le=365 * 86_400)] = None
+    """The sidecar does not talk to peers whose CA signed no revocation list in this time, as far as is known here and
+    by this clock. This needs `tls_dir`. Without this key a list does not age."""
     rekey_after_s: Annotated[int, Field(ge=1, le=86_400)] = 120
-    """Seconds after which the keys that seal datagrams are changed; their volume changes them as well."""
+    """Age at which a path's ends agree on new keys. They also do so after 2^21 datagrams. The robot's value counts.
+    Nothing waits for it."""
     metrics_listen: ListenAddress | None = "127.0.0.1:9464"
-    """address:port of the Prometheus metrics; null for none."""
+    """Where Prometheus reads the metrics; `null` for none."""
     local_socket: LocalSocket | None = "auto"
-    """Absolute path of the unix socket of plr doctor and plr ping; auto: sidecar.sock in the unit's runtime folder, or
-    in state_dir without systemd; null for none."""
+    """Unix socket that `plr doctor` and `plr ping` ask, 101 bytes at most; `null` for none. Root and the sidecar's user
+    may use it; the group `plr` uses the same path with `.group` at its end. `auto` is `sidecar.sock` in the unit's
+    runtime folder (`/run/plr`), or in `state_dir` where systemd does not start the sidecar."""
     log_level: Annotated[LogLevel, converted] = LogLevel.INFO
-    """debug, info, warning or error."""
+    """Least level of what is logged to stderr."""
 
     @model_validator(mode="after")
     def _secured_or_not(self) -> Self:
@@ -236,6 +262,11 @@ def refuse_exposed(config: SidecarConfig, source: str) -> None:
 def config_schema() -> dict[str, Any]:
     """Return the JSON Schema of the configuration file."""
     schema = SidecarConfig.model_json_schema()
+    for section in (schema, *schema["$defs"].values()):
+        for key in section.get("properties", {}).values():
+            # Editors show the description alone.
+            if ROLE_IN_SCHEMA in key:
+                key["description"] = f"{key[ROLE_IN_SCHEMA].capitalize()} only. {key['description']}"
     # With tls_dir the certificate holds them.
     schema["required"] = [key for key in schema["required"] if key not in ("name", "role")]
     return {"$schema": "https://json-schema.org/draft/2020-12/schema", **schema}
@@ -248,18 +279,14 @@ def _cross_checks(config: SidecarConfig) -> Iterator[_Problem]:
     """Yield problems between fields; a key that would have no effect is refused, not ignored."""
     if config.max_revocation_age_s is not None and config.tls_dir is None:
         yield ("max_revocation_age_s",), "expected beside tls_dir only: nothing is checked in insecure mode"
+    for key, problem in config.misplaced(config.role):
+        yield (key,), problem
     for index, service in enumerate(config.services):
         for key, problem in service.problems(config.role):
             yield ("services", index, key), problem
         yield from _check_order(config, index)
-    if config.advertise and config.role is Role.ROBOT:
-        yield ("advertise",), "expected on a cloud only: a robot's addresses come from STUN"
     if config.advertise and config.udp_port == 0:
         yield ("udp_port",), "expected a fixed port beside advertise, got 0"
-    if config.networks and config.role is Role.CLOUD:
-        yield ("networks",), "expected on a robot only: it is the robots' interfaces that are chosen between"
-    if config.region is not None and config.role is Role.ROBOT:
-        yield ("region",), "expected on a cloud only: a robot's copies should go to different regions"
     for index, network in enumerate(config.networks):
         if any(network.interface == before.interface for before in config.networks[:index]):
             yield ("networks", index, "interface"), f"expected each interface once, got '{network.interface}' again"

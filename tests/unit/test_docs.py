@@ -1,23 +1,19 @@
-"""The documentation says what the programs do: keys, metrics, log lines, limits, links."""
+"""The documentation says what the programs do: metrics, log lines, certificates, links."""
 
 from __future__ import annotations
 
 import ast
 import functools
 import re
-import types
 from collections import Counter
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import pytest
-from pydantic import BaseModel
-from pydantic_core import PydanticUndefined
 
 from plr.controlplane.ca import key_file, passphrase
 from plr.controlplane.ca.authority import DEFAULT_DAYS
 from plr.controlplane.ca.request import MAX_REQUEST_BYTES
-from plr.controlplane.config.controlplane import ControlPlaneConfig
 from plr.controlplane.core.control.control import ControlCore
 from plr.controlplane.observe.fleet_metrics import Fleet
 from plr.controlplane.observe.metrics import Metrics
@@ -26,7 +22,6 @@ from plr.protos.convert.fields import MAX_CRL_BYTES
 from plr.protos.model.ids import InterfaceName, NodeName, ServiceName
 from plr.protos.program.tls_files import MAX_FILE_BYTES
 from plr.protos.trust.identity import MAX_CA_CERTIFICATES, Identity, IdentityRole, RevocationList
-from plr.sidecar.config.sidecar import SidecarConfig
 from plr.sidecar.control.client import JUDGE_AGAIN_S
 from plr.sidecar.control.revocations import RevocationState
 from plr.sidecar.core.control.session import ControlStats
@@ -66,59 +61,6 @@ def rows(text: str) -> Iterator[list[str]]:
     for line in text.splitlines():
         if line.startswith("| ") and not line.startswith("| ---"):
             yield [cell.strip() for cell in line.strip("|").split(" | ")]
-
-
-# -- configuration ------------------------------------------------------------------------------------------------
-
-
-def keys_of(model: type[BaseModel], prefix: str = "") -> Iterator[tuple[str, Any]]:
-    """Yield every key as the page writes it, with its default."""
-    for name, field in model.model_fields.items():
-        yield prefix + name, field.default
-        nested, mark = _nested(field.annotation)
-        if nested is not None:
-            yield from keys_of(nested, f"{prefix}{name}{mark}.")
-
-
-def _nested(annotation: Any) -> tuple[type[BaseModel] | None, str]:
-    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
-        return annotation, ""
-    for inner in getattr(annotation, "__args__", ()):
-        found, mark = _nested(inner)
-        if found is not None:
-            return found, mark if isinstance(annotation, types.UnionType) else "[]"
-    return None, ""
-
-
-def documented_keys(program: str) -> dict[str, list[str]]:
-    table = rows(section(read("configuration.md"), f"`{program}`"))
-    return {cells[0].strip("`"): cells for cells in table if cells[0].startswith("`")}
-
-
-@pytest.mark.parametrize(
-    ("program", "model"), [("plr-sidecar", SidecarConfig), ("plr-controlplane", ControlPlaneConfig)]
-)
-def test_every_key_is_documented_and_no_other(program: str, model: type[BaseModel]) -> None:
-    assert sorted(documented_keys(program)) == sorted(key for key, _ in keys_of(model))
-
-
-@pytest.mark.parametrize(
-    ("program", "model", "column"),
-    [("plr-sidecar", SidecarConfig, 3), ("plr-controlplane", ControlPlaneConfig, 2)],
-)
-def test_documented_defaults_are_the_real_ones(program: str, model: type[BaseModel], column: int) -> None:
-    documented = documented_keys(program)
-    checked = 0
-    for key, default in keys_of(model):
-        if isinstance(default, (bool, int, float, str)):
-            cell = documented[key][column]
-            shown = str(default).lower() if isinstance(default, bool) else str(default)
-            assert cell == f"`{shown}`", key
-            checked += 1
-        elif default is PydanticUndefined and model.model_fields.get(key, None) is not None:
-            required = model.model_fields[key].is_required()
-            assert (documented[key][column] == "required") == required, key
-    assert checked >= 2
 
 
 # -- metrics ------------------------------------------------------------------------------------------------------
@@ -249,36 +191,7 @@ def test_a_line_that_nobody_writes_is_noticed() -> None:
     assert not is_written("control plane quietly eaten by wolves")
 
 
-# -- limits -------------------------------------------------------------------------------------------------------
-
-
-def _constants(path: Path) -> dict[str, object]:
-    """Module-level constants that are numbers, or products and shifts of numbers."""
-    found: dict[str, object] = {}
-    for node in ast.parse(path.read_text(encoding="utf-8")).body:
-        if isinstance(node, ast.Assign) and isinstance(node.targets[0], ast.Name):
-            # Only literals and arithmetic on them: names would need the module.
-            if not any(isinstance(part, (ast.Name, ast.Call)) for part in ast.walk(node.value)):
-                found[node.targets[0].id] = eval(compile(ast.Expression(node.value), str(path), "eval"))
-    return found
-
-
-def limit_rows() -> list[tuple[str, str, str]]:
-    found = []
-    for cells in rows(read("limits.md")):
-        match = re.fullmatch(r"`([a-z_/]+\.py)` `([A-Z_0-9]+)`", cells[-1])
-        if match:
-            found.append((match[1], match[2], cells[1]))
-    return found
-
-
-UNITS = {"B": 1, "kB": 1000, "KiB": 1024, "MiB": 1 << 20, "s": 1, "ms": 1e-3}
-
-
-@pytest.mark.parametrize(("path", "name", "shown"), limit_rows())
-def test_limits_have_the_documented_value(path: str, name: str, shown: str) -> None:
-    number, _, unit = shown.partition(" ")
-    assert _constants(ROOT / path)[name] == float(number) * UNITS.get(unit, 1)
+# -- certificates -----------------------------------------------------------------------------------------------
 
 
 def test_the_page_of_certificates_has_the_numbers_of_the_code() -> None:

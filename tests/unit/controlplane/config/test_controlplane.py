@@ -42,6 +42,12 @@ def test_one_address_may_stand_without_a_list() -> None:
     )
 
 
+def test_the_schema_knows_an_address_without_a_list() -> None:
+    one, several = ControlPlaneConfig.model_json_schema()["properties"]["stun_listen"]["anyOf"]
+    assert one == several["items"] == {"type": "string", "format": "address:port"}
+    assert several["maxItems"] == 16
+
+
 def test_path_rules_match_everything_that_they_do_not_name() -> None:
     text = "paths: [{robots: 'arm-*', interfaces: [wwan*, sat0], allow: true}, {clouds: far, allow: false}]"
     assert read(text).settings().path_rules == (

@@ -120,6 +120,10 @@ def test_schema_describes_every_key_and_is_json() -> None:
     assert all("description" in entry or "$ref" in entry for entry in schema["properties"].values())
     service = schema["$defs"]["ServiceConfig"]
     assert all("description" in entry for entry in service["properties"].values())
+    deadline = service["properties"]["deadline_ms"]
+    assert deadline["x-role"] == "robot"
+    assert deadline["description"].startswith("Robot only. ")
+    assert "x-role" not in service["properties"]["lifetime_ms"]
 
 
 def certificate(name: str = "robot-1", role: IdentityRole = IdentityRole.ROBOT) -> Identity:

@@ -46,6 +46,12 @@ def test_copies_to_several_servers_only_when_asked_for() -> None:
     assert rule.priority is Priority.NORMAL
 
 
+def test_a_key_of_a_service_without_a_value_is_as_if_left_out() -> None:
+    empty = dict.fromkeys(("type", "idempotent", "priority", "hedge_quantile", "fallback_start", "cost_per_request"))
+    assert parse(with_service(ROBOT, **empty)) == parse(ROBOT)
+    assert parse(with_service(CLOUD, **empty)) == parse(CLOUD)
+
+
 def test_a_fallback_and_when_it_is_asked() -> None:
     assert parse(ROBOT).service_rules()[0].fallback is None
     (rule,) = parse(with_service(ROBOT, **SAFE, fallback="/local")).service_rules()
