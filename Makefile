@@ -12,7 +12,7 @@ unexport ROS_DISTRO ROS_VERSION ROS_PYTHON_VERSION _ROS_WHEELS_BOOTSTRAP_COMPLET
 # Nothing that we start announces itself to the network.
 export ROS_AUTOMATIC_DISCOVERY_RANGE ?= LOCALHOST
 
-.PHONY: help setup demo test quick fuzz lint format protos interfaces lock bench bench-quick bench-dataplane bench-churn bench-insiders bench-control bench-fleet-day bench-matcher clean distclean
+.PHONY: help setup demo test quick fuzz lint format protos pages interfaces lock bench bench-quick bench-dataplane bench-churn bench-insiders bench-control bench-fleet-day bench-matcher clean distclean
 
 help: ## this list
 	@echo 'usage: make TARGET'
@@ -39,7 +39,7 @@ quick: setup ## what changed since COMMIT=main: lint, its unit tests, a slice of
 fuzz: setup ## a million junk datagrams for each fuzzing test (10 minutes, as root)
 	@$(PY) -m pytest tests/fuzz tests/attacks/test_fuzz.py --fuzz-datagrams 1000000 $(PYTEST_ARGS)
 
-lint: setup ## ruff, mypy, import rules, stub drift
+lint: setup ## ruff, mypy, import rules, drift of stubs and pages
 	@deploy/dev/lint.sh
 
 format: setup ## rewrite the sources the way lint wants them
@@ -48,6 +48,9 @@ format: setup ## rewrite the sources the way lint wants them
 
 protos: setup ## generate the gRPC stubs from protos/plr/v1/*.proto
 	@deploy/dev/protos.sh
+
+pages: setup ## write the keys and the figures of the code into docs/use/configuration.md and docs/operate/limits.md
+	@$(PY) -m deploy.dev.pages
 
 interfaces: setup ## build examples/plr_demo_interfaces into .venv
 

@@ -25,6 +25,7 @@ check "ruff format" .venv/bin/ruff format --check --quiet .
 check "mypy" .venv/bin/mypy --no-error-summary
 check "import rules" import_rules
 check "generated stubs" deploy/dev/protos.sh --check
+check "generated pages" .venv/bin/python -m deploy.dev.pages --check
 
 if ((${#failed[@]})); then
   printf 'lint: failed: %s\n' "$(

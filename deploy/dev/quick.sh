@@ -19,7 +19,7 @@ declare -A folders=()
 for file in "${sources[@]}"; do
   case $file in
   tests/unit/*/*) folder=$(dirname "$file") ;;
-  sidecar/* | controlplane/* | protos/* | lab/* | bench/*) folder=tests/unit/$(dirname "$file") ;;
+  sidecar/* | controlplane/* | protos/* | lab/* | bench/* | deploy/*) folder=tests/unit/$(dirname "$file") ;;
   *) continue ;;
   esac
   compgen -G "$folder/test_*.py" >/dev/null && folders[$folder]=1

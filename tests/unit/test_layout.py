@@ -12,7 +12,7 @@ import pytest
 
 ROOT = Path(__file__).parents[2]
 UNIT = ROOT / "tests" / "unit"
-TOPS = ("sidecar", "controlplane", "protos", "lab", "bench")
+TOPS = ("sidecar", "controlplane", "protos", "lab", "bench", "deploy")
 
 PLANTED = {
     "sidecar/core/wire/frame.py": ("plr.sidecar.core.message.partial", "the sidecar's core in layers"),
