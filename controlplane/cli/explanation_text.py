@@ -63,9 +63,9 @@ def _mapping(found: Explanation) -> Iterator[str]:
         return
     yield _paths(found.mapping.assignments)
     observed = f", observed lately {_probability(found.observed_miss)}" if found.observed_miss is not None else ""
-    charge = f", a request costs {found.charge:g}" if found.charge is not None else ""
+    cost = f", a request costs {found.cost_per_request:g}" if found.cost_per_request is not None else ""
     predicted = found.mapping.predicted_miss if found.predicted_miss is None else found.predicted_miss
-    yield f"predicted miss {_probability(predicted)}{observed}{charge}"
+    yield f"predicted miss {_probability(predicted)}{observed}{cost}"
     age = f", goes there for {_age(found.in_force_s)}" if found.in_force_s is not None else ""
     refused = f" ({found.sync.error})" if found.sync.error else ""
     yield f"version {found.sync.version_sent}, {found.sync.state.value}{refused}{age}"
@@ -172,8 +172,8 @@ def _alternative(other: Alternative) -> tuple[str, ...]:
         case AlternativeKind.WITHOUT:
             what = f"without {other.without}"
     paths = _paths(other.assignments)
-    charge = f"costs {other.charge:g}" if other.charge is not None else ""
-    return what, _probability(other.predicted_miss), charge, f"{paths} ({other.note})" if other.note else paths
+    cost = f"costs {other.cost_per_request:g}" if other.cost_per_request is not None else ""
+    return what, _probability(other.predicted_miss), cost, f"{paths} ({other.note})" if other.note else paths
 
 
 def _change(change: MappingChange) -> tuple[str, ...]:

@@ -96,7 +96,7 @@ def explanation_from_proto(message: admin_pb2.ExplainResponse) -> Explanation:
         in_force_s=_age(message.in_force_us, "in_force_us") if message.HasField("in_force_us") else None,
         observed_miss=_optional(message, "observed_miss"),
         target_miss=probability(message.target_miss, "target_miss"),
-        charge=_charge(message),
+        cost_per_request=_cost_per_request(message),
         pairs=each(message.pairs, MAX_PAIRS, "pairs", _pair_from_proto),
         pairs_left_out=at_most(message.pairs_left_out, MAX_EVENTS, "pairs_left_out"),
         joints=each(message.joints, MAX_JOINTS, "joints", _joint_from_proto),
@@ -122,7 +122,7 @@ def explanation_to_proto(explanation: Explanation) -> admin_pb2.ExplainResponse:
         observed_miss=found.observed_miss,
         predicted_miss=found.predicted_miss,
         target_miss=found.target_miss,
-        charge=found.charge,
+        cost_per_request=found.cost_per_request,
         pairs=map(_pair_to_proto, found.pairs),
         pairs_left_out=found.pairs_left_out,
         joints=map(_joint_to_proto, found.joints),
@@ -137,8 +137,8 @@ def _optional(message: admin_pb2.ExplainResponse, field: Literal["observed_miss"
     return probability(getattr(message, field), field) if message.HasField(field) else None
 
 
-def _charge(message: admin_pb2.ExplainResponse | admin_pb2.Alternative) -> float | None:
-    return _weight(message.charge, "charge") if message.HasField("charge") else None
+def _cost_per_request(message: admin_pb2.ExplainResponse | admin_pb2.Alternative) -> float | None:
+    return _weight(message.cost_per_request, "cost_per_request") if message.HasField("cost_per_request") else None
 
 
 def _age(age_us: int, field: str) -> float:
@@ -250,7 +250,7 @@ def _alternative_from_proto(message: admin_pb2.Alternative) -> Alternative:
         predicted_miss=probability(message.predicted_miss, "predicted_miss"),
         without=node_name(message.without, "without") if message.without else None,
         note=text(message.note, "note"),
-        charge=_charge(message),
+        cost_per_request=_cost_per_request(message),
     )
 
 
@@ -261,7 +261,7 @@ def _alternative_to_proto(alternative: Alternative) -> admin_pb2.Alternative:
         predicted_miss=alternative.predicted_miss,
         without=alternative.without or "",
         note=clean_text(alternative.note),
-        charge=alternative.charge,
+        cost_per_request=alternative.cost_per_request,
     )
 
 

@@ -52,8 +52,8 @@ MAX_EVENTS = 1 << 53
 MAX_CAPACITY = 1_000_000
 """Largest capacity of a server; a larger one is written as 0, no limit."""
 
-MAX_CHARGE = 1e9
-"""Largest charge of an interface or a server for one request; a larger one is a mistake."""
+MAX_COST_PER_REQUEST = 1e9
+"""Largest cost of a request over an interface or at a server; a larger one is a mistake."""
 
 MAX_COPIES = 256
 """Copies of one request: as many as a robot can have interfaces."""
@@ -86,10 +86,10 @@ def probability(value: float, field: str) -> float:
     return value
 
 
-def charge(value: float, field: str) -> float:
+def cost(value: float, field: str) -> float:
     """Check what a request costs."""
-    if not (math.isfinite(value) and 0.0 <= value <= MAX_CHARGE):
-        raise DecodeError(f"{field} {value} is not within 0..{MAX_CHARGE:.0f}")
+    if not (math.isfinite(value) and 0.0 <= value <= MAX_COST_PER_REQUEST):
+        raise DecodeError(f"{field} {value} is not within 0..{MAX_COST_PER_REQUEST:.0f}")
     return value
 
 

@@ -14,7 +14,7 @@ from plr.protos.convert.fields import (
     MAX_COPIES,
     MAX_OFFERS,
     at_most,
-    charge,
+    cost,
     duration,
     each,
     known,
@@ -166,13 +166,15 @@ def _label_from_proto(message: types_pb2.InterfaceLabel) -> InterfaceLabel:
     return InterfaceLabel(
         interface=interface_name(message.interface, "interface"),
         carrier=domain_label(message.carrier, "carrier"),
-        charge=charge(message.charge, "charge"),
+        cost_per_request=cost(message.cost_per_request, "cost_per_request"),
     )
 
 
 def label_to_proto(label: InterfaceLabel) -> types_pb2.InterfaceLabel:
     """Encode what a sidecar says about an interface."""
-    return types_pb2.InterfaceLabel(interface=label.interface, carrier=label.carrier, charge=label.charge)
+    return types_pb2.InterfaceLabel(
+        interface=label.interface, carrier=label.carrier, cost_per_request=label.cost_per_request
+    )
 
 
 def offer_from_proto(message: types_pb2.ServiceOffer) -> ServiceOffer:
@@ -181,13 +183,15 @@ def offer_from_proto(message: types_pb2.ServiceOffer) -> ServiceOffer:
         name=service_name(message.name, "service"),
         type=type_name(message.type, "type"),
         capacity=at_most(message.capacity, MAX_CAPACITY, "capacity"),
-        charge=charge(message.charge, "charge"),
+        cost_per_request=cost(message.cost_per_request, "cost_per_request"),
     )
 
 
 def offer_to_proto(offer: ServiceOffer) -> types_pb2.ServiceOffer:
     """Encode an offer."""
-    return types_pb2.ServiceOffer(name=offer.name, type=offer.type, capacity=offer.capacity, charge=offer.charge)
+    return types_pb2.ServiceOffer(
+        name=offer.name, type=offer.type, capacity=offer.capacity, cost_per_request=offer.cost_per_request
+    )
 
 
 def offers_from_proto(messages: Sequence[types_pb2.ServiceOffer]) -> tuple[ServiceOffer, ...]:

@@ -124,7 +124,7 @@ class Alternative:
     without: NodeName | None = None
     note: str = ""
     """Objections to it, in words."""
-    charge: float | None = None
+    cost_per_request: float | None = None
     """Cost of a request with all its copies; None unless the service is in mode cheapest."""
 
 
@@ -157,7 +157,7 @@ class Explanation:
     """How long the current assignments have been in force; None if that is forgotten."""
     target_miss: float = 0.0
     """Above 0: the cheapest mapping that misses no more often is chosen."""
-    charge: float | None = None
+    cost_per_request: float | None = None
     """Cost of a request with all its copies; None unless the service is in mode cheapest."""
     observed_miss: float | None = None
     """Share of recent requests that missed the deadline or failed; None without any."""

@@ -26,7 +26,7 @@ from plr.protos.model.redundancy_mode import DEFAULT_HEDGE_QUANTILE, RedundancyM
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-DEFAULT_CHARGE = 1.0
+DEFAULT_COST_PER_REQUEST = 1.0
 """Default cost of a request over an interface, so that a service in mode cheapest sends few copies where their cost is
 unknown."""
 
@@ -38,7 +38,7 @@ class InterfaceLabel:
     interface: InterfaceName
     carrier: str = ""
     """Carrier whose network it uses; interfaces with the same carrier fail together. Empty if unknown."""
-    charge: float = DEFAULT_CHARGE
+    cost_per_request: float = DEFAULT_COST_PER_REQUEST
     """Cost of a request over it, in any one currency."""
 
 
@@ -125,8 +125,8 @@ class ServiceOffer:
     name: ServiceName
     type: str
     capacity: int = 0
-    charge: float = 0.0
-    """Cost of a request run there, in the currency of the interfaces' charges."""
+    cost_per_request: float = 0.0
+    """Cost of a request run there, in the currency of the interfaces' costs."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING, Annotated
 
 from pydantic import Field, model_validator
 
-from plr.protos.convert.fields import MAX_CHARGE
+from plr.protos.convert.fields import MAX_COST_PER_REQUEST
 from plr.protos.model.ids import Role, ServiceName
-from plr.protos.model.members import AT_MOST_EVERY_INTERFACE, DEFAULT_CHARGE, EVERY_INTERFACE
+from plr.protos.model.members import AT_MOST_EVERY_INTERFACE, DEFAULT_COST_PER_REQUEST, EVERY_INTERFACE
 from plr.protos.model.redundancy_mode import DEFAULT_ADAPTIVE_TARGET, DEFAULT_HEDGE_QUANTILE, RedundancyMode
 from plr.sidecar.config.fields import (
     CopiesWanted,
@@ -98,7 +98,7 @@ class NetworkConfig(Section):
     """Name or glob of interfaces. Each is written once."""
     carrier: DomainLabel | None = None
     """Name of the network's operator. Interfaces with the same carrier are assumed to fail together."""
-    cost_per_request: Annotated[float, Field(ge=0, le=MAX_CHARGE)] = DEFAULT_CHARGE
+    cost_per_request: Annotated[float, Field(ge=0, le=MAX_COST_PER_REQUEST)] = DEFAULT_COST_PER_REQUEST
     """Cost of a copy of a request over it, in any one currency. It counts for services with `mode: cheapest`. The
     control stream prefers what costs less, too."""
     extra_load: Annotated[float | None, Field(ge=0, le=MAX_EXTRA_LOAD)] = None
@@ -211,7 +211,7 @@ class ServiceConfig(Section):
     """How many interfaces of all robots together the control plane may map to this server for the service. The limit is
     exceeded, and reported, when there is no other way. Without this key there is none."""
     cost_per_request: Annotated[
-        float, Field(ge=0, le=MAX_CHARGE), OnlyOn(Role.CLOUD, "a robot's costs are its networks'")
+        float, Field(ge=0, le=MAX_COST_PER_REQUEST), OnlyOn(Role.CLOUD, "a robot's costs are its networks'")
     ] = 0.0
     """Cost of a request that this server runs, in the currency of the robots' networks. It counts for robots' services
     with `mode: cheapest`."""
@@ -250,7 +250,7 @@ class ServiceConfig(Section):
             copies=self.copies or (AT_MOST_EVERY_INTERFACE if cheapest else EVERY_INTERFACE),
             target_miss=(self.target_miss or 0.0) if cheapest else 0.0,
             wanted_miss=self.target_miss or 0.0,
-            charge=self.cost_per_request,
+            cost_per_request=self.cost_per_request,
             fallback=self._fallback_rule(),
         )
 

@@ -13,7 +13,7 @@ from pydantic import AfterValidator, Field, model_validator
 from plr.protos.base.errors import ConfigError
 from plr.protos.base.host_port import is_loopback
 from plr.protos.model.ids import NodeName, Role, ServiceName
-from plr.protos.model.members import DEFAULT_CHARGE, InterfaceLabel
+from plr.protos.model.members import DEFAULT_COST_PER_REQUEST, InterfaceLabel
 from plr.protos.program.config_fields import (
     AbsolutePath,
     IpAddress,
@@ -203,7 +203,7 @@ class SidecarConfig(Section):
         """Return the price of the control stream over an interface."""
         network = self._network(interface)
         if network is None:
-            return Price(charge=DEFAULT_CHARGE)
+            return Price(cost_per_request=DEFAULT_COST_PER_REQUEST)
         return Price(network.extra_mb_per_day is not None, network.cost_per_request)
 
     def _network(self, interface: InterfaceName) -> NetworkConfig | None:

@@ -139,9 +139,7 @@ def test_what_paths_share_and_what_they_cost_is_told() -> None:
         world.say(cloud, CandidateSet(interfaces("eth0")))
         world.say(cloud, ServiceSet((offer(),)))
     robot = world.join(registration("robot"))
-    labels = tuple(
-        InterfaceLabel(InterfaceName(nic), "blue", charge) for nic, charge in (("wlan0", 1.0), ("wwan0", 3.0))
-    )
+    labels = tuple(InterfaceLabel(InterfaceName(nic), "blue", cost) for nic, cost in (("wlan0", 1.0), ("wwan0", 3.0)))
     world.say(robot, CandidateSet(interfaces("wlan0", "wwan0"), labels))
     world.say(robot, ServiceSet((), (replace(use(), target_miss=0.001, copies=AT_MOST_EVERY_INTERFACE),)))
     world.all_up(robot, ("a", "b"))
@@ -149,13 +147,13 @@ def test_what_paths_share_and_what_they_cost_is_told() -> None:
     measured(world, robot, seconds=20, misses={("wlan0", "a"): 0.1, ("wwan0", "b"): 0.1})
     found = asked(world)
     assert found.target_miss == 0.001
-    assert found.charge == 1.0
+    assert found.cost_per_request == 1.0
     assert found.mapping is not None
     assert found.mapping.assignments == (on("wlan0", "b"),)
     (joint,) = found.joints
     assert joint.shared == ("carrier blue", "region eu")
     other = next(other for other in found.alternatives if len(other.assignments) == 2)
-    assert (other.charge, other.note) == (4.0, "copies share region eu, carrier blue")
+    assert (other.cost_per_request, other.note) == (4.0, "copies share region eu, carrier blue")
     text = render(found)
     assert "cheapest that misses at most 0.001" in text
     assert "a request costs 1" in text

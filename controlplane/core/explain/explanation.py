@@ -167,7 +167,7 @@ def explain(
         in_force_s=now - history.since if history is not None else None,
         observed_miss=estimator.observed_miss_ratio(robot.name, use.name, now),
         target_miss=use.target_miss,
-        charge=_charge(block, planned),
+        cost_per_request=_cost_per_request(block, planned),
         pairs=_pairs(paths, notes, block, estimator, key, mapping, now),
         pairs_left_out=max(0, len(paths) - MAX_PAIRS),
         joints=_joints(robot.name, use.name, block, estimator, now),
@@ -287,7 +287,7 @@ def _region(block: Block | None, server: NodeName) -> str:
     return block.regions[block.servers.index(server)]
 
 
-def _charge(block: Block | None, plan: BlockPlan | None) -> float | None:
+def _cost_per_request(block: Block | None, plan: BlockPlan | None) -> float | None:
     return plan.charge if block is not None and block.target is not None and plan is not None else None
 
 

@@ -1,6 +1,6 @@
 """Builds one block of the assignment problem from measurements, and its rules from what members declare.
 
-Robots and clouds declare their interfaces' labels, regions, charges and wishes. `problem_builder` decides which blocks
+Robots and clouds declare their interfaces' labels, regions, costs and wishes. `problem_builder` decides which blocks
 there are and when each is built.
 """
 
@@ -48,12 +48,13 @@ def _if_any(labels: list[str]) -> tuple[str, ...]:
 def _target(use: ServiceUse, labels: Iterable[InterfaceLabel], servers: Iterable[Sidecar]) -> Target:
     of_servers = [_charge_of(cloud, use.name) for cloud in servers]
     return Target(
-        use.target_miss, tuple(tuple(label.charge + of_server for of_server in of_servers) for label in labels)
+        use.target_miss,
+        tuple(tuple(label.cost_per_request + of_server for of_server in of_servers) for label in labels),
     )
 
 
 def _charge_of(cloud: Sidecar, service: ServiceName) -> float:
-    return next((offer.charge for offer in cloud.offers if offer.name == service), 0.0)
+    return next((offer.cost_per_request for offer in cloud.offers if offer.name == service), 0.0)
 
 
 KEPT_PAIRS = 8

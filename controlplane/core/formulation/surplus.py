@@ -54,7 +54,7 @@ def most_promising(
     rankings = [sorted(best_first, key=lambda interface: turn[interface])]
     if use.target_miss:
         rankings.append(
-            sorted(best_first, key=lambda interface: labels[interface].charge if interface in labels else 1.0)
+            sorted(best_first, key=lambda interface: labels[interface].cost_per_request if interface in labels else 1.0)
         )
     order = dict.fromkeys(itertools.chain.from_iterable(zip(*rankings, strict=True)))
     taken = set(itertools.islice(order, MAX_PLANNED))

@@ -8,7 +8,8 @@ Beyond the paper:
 
 - Fewer copies than interfaces: at most one for each, or a number of them (`Copies`).
 - Failure domains: servers have regions and interfaces have carriers, which copies should not share (`domains`).
-- A block may have a target instead of the objective: the least charge that keeps its miss probability below it.
+- A block may have a target instead of the objective: the least charge that keeps its miss probability below it. The
+  charge of a choice is the sum of its copies' `cost_per_request`; "cost" is what the solver minimises.
 - A server may limit how many interfaces of all robots it serves (`Problem.fleet_capacity`).
 - A service that is not idempotent goes to one server over all interfaces; capacity within the block does not apply.
 - If no assignment keeps to the capacities, they are exceeded by the least total number of interfaces, and the

@@ -809,14 +809,14 @@ class Alternative(_message.Message):
     PREDICTED_MISS_FIELD_NUMBER: _builtins.int
     WITHOUT_FIELD_NUMBER: _builtins.int
     NOTE_FIELD_NUMBER: _builtins.int
-    CHARGE_FIELD_NUMBER: _builtins.int
+    COST_PER_REQUEST_FIELD_NUMBER: _builtins.int
     kind: Global___AlternativeKind.ValueType
     predicted_miss: _builtins.float
     without: _builtins.str
     """The server that is left out."""
     note: _builtins.str
     """What speaks against it, in words."""
-    charge: _builtins.float
+    cost_per_request: _builtins.float
     """What a request would cost with all its copies; absent unless the service is to be cheap."""
     @_builtins.property
     def assignments(self) -> _containers.RepeatedCompositeFieldContainer[_control_pb2.Assignment]:
@@ -830,15 +830,15 @@ class Alternative(_message.Message):
         predicted_miss: _builtins.float = ...,
         without: _builtins.str = ...,
         note: _builtins.str = ...,
-        charge: _builtins.float | None = ...,
+        cost_per_request: _builtins.float | None = ...,
     ) -> None: ...
-    _HasFieldArgType: _TypeAlias = _typing.Literal["_charge", b"_charge", "charge", b"charge"]  # noqa: Y015
+    _HasFieldArgType: _TypeAlias = _typing.Literal["_cost_per_request", b"_cost_per_request", "cost_per_request", b"cost_per_request"]  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["_charge", b"_charge", "assignments", b"assignments", "charge", b"charge", "kind", b"kind", "note", b"note", "predicted_miss", b"predicted_miss", "without", b"without"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["_cost_per_request", b"_cost_per_request", "assignments", b"assignments", "cost_per_request", b"cost_per_request", "kind", b"kind", "note", b"note", "predicted_miss", b"predicted_miss", "without", b"without"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
-    _WhichOneofReturnType__charge: _TypeAlias = _typing.Literal["charge"]  # noqa: Y015
-    _WhichOneofArgType__charge: _TypeAlias = _typing.Literal["_charge", b"_charge"]  # noqa: Y015
-    def WhichOneof(self, oneof_group: _WhichOneofArgType__charge) -> _WhichOneofReturnType__charge | None: ...
+    _WhichOneofReturnType__cost_per_request: _TypeAlias = _typing.Literal["cost_per_request"]  # noqa: Y015
+    _WhichOneofArgType__cost_per_request: _TypeAlias = _typing.Literal["_cost_per_request", b"_cost_per_request"]  # noqa: Y015
+    def WhichOneof(self, oneof_group: _WhichOneofArgType__cost_per_request) -> _WhichOneofReturnType__cost_per_request | None: ...
 
 Global___Alternative: _TypeAlias = Alternative  # noqa: Y015
 
@@ -887,7 +887,7 @@ class ExplainResponse(_message.Message):
     ALTERNATIVES_FIELD_NUMBER: _builtins.int
     CHANGES_FIELD_NUMBER: _builtins.int
     TARGET_MISS_FIELD_NUMBER: _builtins.int
-    CHARGE_FIELD_NUMBER: _builtins.int
+    COST_PER_REQUEST_FIELD_NUMBER: _builtins.int
     PREDICTED_MISS_FIELD_NUMBER: _builtins.int
     GONE_US_FIELD_NUMBER: _builtins.int
     GONE_REASON_FIELD_NUMBER: _builtins.int
@@ -905,7 +905,7 @@ class ExplainResponse(_message.Message):
     """Pairs that were too many to be told of."""
     target_miss: _builtins.float
     """Above 0: the service goes where it is cheapest as long as it misses no more often."""
-    charge: _builtins.float
+    cost_per_request: _builtins.float
     """What a request costs with all its copies; absent unless the service is to be cheap."""
     predicted_miss: _builtins.float
     """What is predicted now; `mapping` has what was predicted when it was sent. Absent if nothing is planned."""
@@ -946,17 +946,17 @@ class ExplainResponse(_message.Message):
         alternatives: _abc.Iterable[Global___Alternative] | None = ...,
         changes: _abc.Iterable[Global___MappingChange] | None = ...,
         target_miss: _builtins.float = ...,
-        charge: _builtins.float | None = ...,
+        cost_per_request: _builtins.float | None = ...,
         predicted_miss: _builtins.float | None = ...,
         gone_us: _builtins.int | None = ...,
         gone_reason: Global___DepartureReason.ValueType = ...,
     ) -> None: ...
-    _HasFieldArgType: _TypeAlias = _typing.Literal["_charge", b"_charge", "_gone_us", b"_gone_us", "_in_force_us", b"_in_force_us", "_observed_miss", b"_observed_miss", "_predicted_miss", b"_predicted_miss", "charge", b"charge", "gone_us", b"gone_us", "in_force_us", b"in_force_us", "mapping", b"mapping", "observed_miss", b"observed_miss", "predicted_miss", b"predicted_miss", "sync", b"sync"]  # noqa: Y015
+    _HasFieldArgType: _TypeAlias = _typing.Literal["_cost_per_request", b"_cost_per_request", "_gone_us", b"_gone_us", "_in_force_us", b"_in_force_us", "_observed_miss", b"_observed_miss", "_predicted_miss", b"_predicted_miss", "cost_per_request", b"cost_per_request", "gone_us", b"gone_us", "in_force_us", b"in_force_us", "mapping", b"mapping", "observed_miss", b"observed_miss", "predicted_miss", b"predicted_miss", "sync", b"sync"]  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["_charge", b"_charge", "_gone_us", b"_gone_us", "_in_force_us", b"_in_force_us", "_observed_miss", b"_observed_miss", "_predicted_miss", b"_predicted_miss", "alternatives", b"alternatives", "changes", b"changes", "charge", b"charge", "deadline_us", b"deadline_us", "gone_reason", b"gone_reason", "gone_us", b"gone_us", "idempotent", b"idempotent", "in_force_us", b"in_force_us", "joints", b"joints", "mapping", b"mapping", "objective", b"objective", "observed_miss", b"observed_miss", "pairs", b"pairs", "pairs_left_out", b"pairs_left_out", "predicted_miss", b"predicted_miss", "robot", b"robot", "service", b"service", "sync", b"sync", "target_miss", b"target_miss"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["_cost_per_request", b"_cost_per_request", "_gone_us", b"_gone_us", "_in_force_us", b"_in_force_us", "_observed_miss", b"_observed_miss", "_predicted_miss", b"_predicted_miss", "alternatives", b"alternatives", "changes", b"changes", "cost_per_request", b"cost_per_request", "deadline_us", b"deadline_us", "gone_reason", b"gone_reason", "gone_us", b"gone_us", "idempotent", b"idempotent", "in_force_us", b"in_force_us", "joints", b"joints", "mapping", b"mapping", "objective", b"objective", "observed_miss", b"observed_miss", "pairs", b"pairs", "pairs_left_out", b"pairs_left_out", "predicted_miss", b"predicted_miss", "robot", b"robot", "service", b"service", "sync", b"sync", "target_miss", b"target_miss"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
-    _WhichOneofReturnType__charge: _TypeAlias = _typing.Literal["charge"]  # noqa: Y015
-    _WhichOneofArgType__charge: _TypeAlias = _typing.Literal["_charge", b"_charge"]  # noqa: Y015
+    _WhichOneofReturnType__cost_per_request: _TypeAlias = _typing.Literal["cost_per_request"]  # noqa: Y015
+    _WhichOneofArgType__cost_per_request: _TypeAlias = _typing.Literal["_cost_per_request", b"_cost_per_request"]  # noqa: Y015
     _WhichOneofReturnType__gone_us: _TypeAlias = _typing.Literal["gone_us"]  # noqa: Y015
     _WhichOneofArgType__gone_us: _TypeAlias = _typing.Literal["_gone_us", b"_gone_us"]  # noqa: Y015
     _WhichOneofReturnType__in_force_us: _TypeAlias = _typing.Literal["in_force_us"]  # noqa: Y015
@@ -966,7 +966,7 @@ class ExplainResponse(_message.Message):
     _WhichOneofReturnType__predicted_miss: _TypeAlias = _typing.Literal["predicted_miss"]  # noqa: Y015
     _WhichOneofArgType__predicted_miss: _TypeAlias = _typing.Literal["_predicted_miss", b"_predicted_miss"]  # noqa: Y015
     @_typing.overload
-    def WhichOneof(self, oneof_group: _WhichOneofArgType__charge) -> _WhichOneofReturnType__charge | None: ...
+    def WhichOneof(self, oneof_group: _WhichOneofArgType__cost_per_request) -> _WhichOneofReturnType__cost_per_request | None: ...
     @_typing.overload
     def WhichOneof(self, oneof_group: _WhichOneofArgType__gone_us) -> _WhichOneofReturnType__gone_us | None: ...
     @_typing.overload

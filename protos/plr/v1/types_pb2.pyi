@@ -146,22 +146,22 @@ class InterfaceLabel(_message.Message):
 
     INTERFACE_FIELD_NUMBER: _builtins.int
     CARRIER_FIELD_NUMBER: _builtins.int
-    CHARGE_FIELD_NUMBER: _builtins.int
+    COST_PER_REQUEST_FIELD_NUMBER: _builtins.int
     interface: _builtins.str
     carrier: _builtins.str
     """Whose network it uses; interfaces with the same one fail together. Empty: not known."""
-    charge: _builtins.float
+    cost_per_request: _builtins.float
     """What a request over it costs, in any one currency."""
     def __init__(
         self,
         *,
         interface: _builtins.str = ...,
         carrier: _builtins.str = ...,
-        charge: _builtins.float = ...,
+        cost_per_request: _builtins.float = ...,
     ) -> None: ...
     _HasFieldArgType: _TypeAlias = _Never  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["carrier", b"carrier", "charge", b"charge", "interface", b"interface"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["carrier", b"carrier", "cost_per_request", b"cost_per_request", "interface", b"interface"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     def WhichOneof(self, oneof_group: _Never) -> None: ...
 
@@ -176,13 +176,13 @@ class ServiceOffer(_message.Message):
     NAME_FIELD_NUMBER: _builtins.int
     TYPE_FIELD_NUMBER: _builtins.int
     CAPACITY_FIELD_NUMBER: _builtins.int
-    CHARGE_FIELD_NUMBER: _builtins.int
+    COST_PER_REQUEST_FIELD_NUMBER: _builtins.int
     name: _builtins.str
     type: _builtins.str
     """ROS type, such as nav_msgs/srv/GetPlan."""
     capacity: _builtins.int
     """How many robot interfaces may be mapped to this server for this service; 0 means no limit."""
-    charge: _builtins.float
+    cost_per_request: _builtins.float
     """What a request costs that runs here, in the same currency as an interface's."""
     def __init__(
         self,
@@ -190,11 +190,11 @@ class ServiceOffer(_message.Message):
         name: _builtins.str = ...,
         type: _builtins.str = ...,
         capacity: _builtins.int = ...,
-        charge: _builtins.float = ...,
+        cost_per_request: _builtins.float = ...,
     ) -> None: ...
     _HasFieldArgType: _TypeAlias = _Never  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["capacity", b"capacity", "charge", b"charge", "name", b"name", "type", b"type"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["capacity", b"capacity", "cost_per_request", b"cost_per_request", "name", b"name", "type", b"type"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     def WhichOneof(self, oneof_group: _Never) -> None: ...
 

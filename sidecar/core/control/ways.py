@@ -63,7 +63,7 @@ class Price(NamedTuple):
 
     billed: bool = False
     """Whether its bytes are counted."""
-    charge: float = 0.0
+    cost_per_request: float = 0.0
     """Cost of a request over it, the best guess of the cost of other traffic."""
 
 

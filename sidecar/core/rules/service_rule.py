@@ -98,7 +98,7 @@ class ServiceRule:
     """Robot: what answers here when the network does not; `pattern` is then a name."""
     capacity: int = 0
     """Cloud: number of robot interfaces that may be mapped here; 0 means no limit."""
-    charge: float = 0.0
+    cost_per_request: float = 0.0
     """Cloud: cost of a request that runs here."""
 
 

@@ -362,7 +362,7 @@ class CloudSide:
         self._stats.mismatched = frozenset(name for name, runner in self._runners.items() if runner.server.mismatched)
         self._stats.silent = frozenset(name for name, runner in self._runners.items() if runner.server.lost)
         offers = tuple(
-            ServiceOffer(name, runner.type.name, rule.capacity, rule.charge)
+            ServiceOffer(name, runner.type.name, rule.capacity, rule.cost_per_request)
             for name, runner in sorted(ready.items())
             if (rule := self._rules.find(name)) is not None
         )

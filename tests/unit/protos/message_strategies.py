@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from plr.protos.base.histogram import BUCKETS, MAX_COUNT, Histogram
 from plr.protos.base.size_class import SIZE_CLASSES
 from plr.protos.convert.control import MAX_WALL_S
-from plr.protos.convert.fields import MAX_CAPACITY, MAX_CHARGE, MAX_COPIES, MAX_DURATION_S, MAX_EVENTS
+from plr.protos.convert.fields import MAX_CAPACITY, MAX_COPIES, MAX_COST_PER_REQUEST, MAX_DURATION_S, MAX_EVENTS
 from plr.protos.convert.types import LEAST_TARGET
 from plr.protos.model.explanation import (
     Alternative,
@@ -131,12 +131,12 @@ def _tuples(
     return st.lists(elements, max_size=size, unique_by=attribute).map(lambda found: tuple(found))
 
 
-charges = st.floats(0.0, MAX_CHARGE)
+costs = st.floats(0.0, MAX_COST_PER_REQUEST)
 domain_labels = st.just("") | st.from_regex(r"[A-Za-z0-9][A-Za-z0-9_.&+-]{0,10}", fullmatch=True)
 copies = st.tuples(st.integers(0, MAX_COPIES), st.just(0)) | st.tuples(
     st.integers(1, MAX_COPIES), st.integers(1, MAX_COPIES)
 ).map(sorted)
-offers = st.builds(ServiceOffer, service_names, type_names, st.integers(0, MAX_CAPACITY), charges)
+offers = st.builds(ServiceOffer, service_names, type_names, st.integers(0, MAX_CAPACITY), costs)
 uses = st.builds(
     ServiceUse,
     service_names,
@@ -188,9 +188,9 @@ def candidate_sets(draw: st.DrawFn) -> CandidateSet:
     candidates = draw(candidate_tuples())
     names = sorted({candidate.interface for candidate in candidates})
     labelled = draw(st.lists(st.sampled_from(names), unique=True)) if names else []
-    labels = tuple(InterfaceLabel(name, draw(domain_labels), draw(charges)) for name in labelled)
+    labels = tuple(InterfaceLabel(name, draw(domain_labels), draw(costs)) for name in labelled)
     others = draw(st.lists(interface_names.filter(lambda name: name not in names), unique=True, max_size=4))
-    down = tuple(InterfaceLabel(name, draw(domain_labels), draw(charges)) for name in others)
+    down = tuple(InterfaceLabel(name, draw(domain_labels), draw(costs)) for name in others)
     return CandidateSet(candidates, labels, draw(uint64), draw(signatures), down)
 
 

@@ -191,7 +191,7 @@ def at(ip: bytes, port: int = 4000) -> dict[str, Any]:
 
 def labels(*changes: dict[str, Any]) -> control_pb2.SidecarMessage:
     message = candidates({})
-    fields: dict[str, Any] = {"interface": "wlan0", "carrier": "telekom", "charge": 2.0}
+    fields: dict[str, Any] = {"interface": "wlan0", "carrier": "telekom", "cost_per_request": 2.0}
     message.candidates.labels.extend(types_pb2.InterfaceLabel(**(fields | change)) for change in changes)
     return message
 
@@ -289,7 +289,10 @@ def test_the_samples_that_the_next_test_breaks_are_good() -> None:
         (services(uses=[use(), use()]), "uses"),
         (services(offers=[types_pb2.ServiceOffer(name="/a", type="a/srv/A", capacity=1 << 31)]), "capacity"),
         (services(offers=[types_pb2.ServiceOffer(name="/a", type="a/srv/A")] * 2), "offers"),
-        (services(offers=[types_pb2.ServiceOffer(name="/a", type="a/srv/A", charge=-1.0)]), "charge"),
+        (
+            services(offers=[types_pb2.ServiceOffer(name="/a", type="a/srv/A", cost_per_request=-1.0)]),
+            "cost_per_request",
+        ),
         (services(uses=[use(target_miss=1.5)]), "target_miss"),
         (services(uses=[use(target_miss=math.nan)]), "target_miss"),
         (services(uses=[use(least_copies=257)]), "least_copies"),
@@ -301,7 +304,7 @@ def test_the_samples_that_the_next_test_breaks_are_good() -> None:
         (labels({"interface": "wwan0"}), "labels"),
         (labels({}, {}), "labels"),
         (labels({"carrier": "a\n"}), "carrier"),
-        (labels({"charge": math.inf}), "charge"),
+        (labels({"cost_per_request": math.inf}), "cost_per_request"),
         (latency(server=""), "server"),
         (latency(network=types_pb2.Histogram(layout=2, index=[1], count=[1])), "layout"),
         (latency(size_class=7), "size_class"),

@@ -193,5 +193,9 @@ def test_what_the_control_stream_costs_comes_from_the_networks() -> None:
     ]
     config = parse(ROBOT, networks=networks)
     prices = [config.price(InterfaceName(name)) for name in ("wlan0", "wwan1", "wwan0")]
-    assert prices == [Price(charge=1.0), Price(charge=2.0), Price(billed=True, charge=0.1)]
+    assert prices == [
+        Price(cost_per_request=1.0),
+        Price(cost_per_request=2.0),
+        Price(billed=True, cost_per_request=0.1),
+    ]
     assert prices == sorted(prices)

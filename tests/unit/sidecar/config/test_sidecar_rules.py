@@ -90,7 +90,7 @@ def test_what_is_wanted_of_the_mapping() -> None:
     assert (rule.copies, rule.target_miss) == (AT_MOST_EVERY_INTERFACE, 0.001)
     (rule,) = parse(with_service(ROBOT, mode="cheapest", target_miss=0.001, copies=2)).service_rules()
     assert rule.copies == Copies(2, 2)
-    assert parse(with_service(CLOUD, cost_per_request=2)).service_rules()[0].charge == 2.0
+    assert parse(with_service(CLOUD, cost_per_request=2)).service_rules()[0].cost_per_request == 2.0
 
 
 def test_the_first_network_that_matches_an_interface_labels_it() -> None:

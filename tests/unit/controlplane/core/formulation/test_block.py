@@ -194,7 +194,7 @@ def test_labels_charges_and_wishes_become_rules_of_the_block() -> None:
     wish = dataclasses.replace(use(), copies=Copies(1, 2), target_miss=0.01)
     labels = (InterfaceLabel(InterfaceName("wwan0"), "telekom", 2.0),)
     here = dataclasses.replace(robot(wish), labels=labels)
-    away = cloud("b", dataclasses.replace(offer(), charge=0.5))
+    away = cloud("b", dataclasses.replace(offer(), cost_per_request=0.5))
     far = dataclasses.replace(away, registration=dataclasses.replace(away.registration, region="eu"))
     (block,) = picture(here, cloud("a"), far).problem.blocks
     assert (block.carriers, block.regions, block.copies) == (("", "telekom"), ("", "eu"), Copies(1, 2))

@@ -28,8 +28,8 @@ V4: Address = ("192.0.2.1", 50051)
 V6: Address = ("2001:db8::1", 50051)
 OTHER: Address = ("192.0.2.2", 50051)
 UP, UNSTABLE, DOWN = PathState.UP, PathState.UNSTABLE, PathState.DOWN
-BILLED = Price(billed=True, charge=1.0)
-FREE = Price(charge=1.0)
+BILLED = Price(billed=True, cost_per_request=1.0)
+FREE = Price(cost_per_request=1.0)
 
 
 def interface(name: InterfaceName, price: Price = FREE, *addresses: str) -> ControlInterface:
@@ -48,7 +48,7 @@ def order(ways: ControlWays, now: float = 0.0) -> list[Way]:
 
 
 def test_the_cheaper_interfaces_come_first_and_the_routing_table_last() -> None:
-    ways = ways_of(interface(WWAN, BILLED), interface(ETH, Price(charge=2.0)), interface(WLAN))
+    ways = ways_of(interface(WWAN, BILLED), interface(ETH, Price(cost_per_request=2.0)), interface(WLAN))
     assert order(ways) == [Way(WLAN, V4), Way(ETH, V4), Way(WWAN, V4), Way(None, V4)]
     assert [one.head_start_s for one in ways.classes(0.0)] == [HEAD_START_S] * 4
     ways.set_paths({WLAN: UP}, 1.0)
