@@ -191,8 +191,8 @@ class ServiceConfig(Section):
     exploration: Annotated[float, Field(ge=0, le=MAX_EXPLORATION), _ROBOT] = DEFAULT_EXPLORATION
     """At most this share of the requests gets one more copy, over a pair of interface and server about which too little
     is known: `redundancy` or a budget leaves that pair out, or (idempotent services) the mapping does not use it. There
-    are at most 12 such copies a minute, none of requests beyond 128 KiB or over a busy interface. `0` turns this off.
-    Only idempotent services may set another value."""
+    are at most 12 such copies a minute, none of requests beyond 128 KiB or over a busy interface. `0` turns this off;
+    only idempotent services may set another value."""
     fallback: Annotated[FullServiceName | None, _ROBOT] = None
     """Full name of a service of the same type, served by a node on this robot, that answers when the network does not.
     The first answer wins. The key needs the full name of one service with `idempotent: true`. A fallback is never
