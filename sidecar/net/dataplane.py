@@ -21,6 +21,7 @@ from plr.sidecar.core.engine.engine import Engine, EngineConfig
 from plr.sidecar.core.link.pinging import Pong
 from plr.sidecar.core.seam.links import CheckPaths, Ping, ResetPaths, SendClose, SetCredential
 from plr.sidecar.net.decoder import Decoder
+from plr.sidecar.net.engine_turn import EngineTurn
 from plr.sidecar.net.timerfd import Timer
 from plr.sidecar.net.watchdog import LOOK_EVERY_S, Watchdog
 
@@ -86,6 +87,7 @@ class ThreadedDataPlane:
         self._clock = time.monotonic
         self._engine = Engine(config, own, self._clock())
         self._lock = threading.RLock()  # the application may call us from its `handle`
+        self._turn = EngineTurn(self._engine, self._lock, self._clock, self._queue_outputs)
         self._links: dict[InterfaceName, InterfaceThread] = {}
         self._timer = Timer()
         self._decoder = Decoder(self)
@@ -107,12 +109,10 @@ class ThreadedDataPlane:
 
     def set_links(self, links: dict[InterfaceName, InterfaceThread]) -> None:
         """Use these interfaces from now on; the caller starts and stops their threads."""
-        with self._lock:
+        with self._turn as (_, now):
             self._links = dict(links)
-            self._use_links_that_run(self._clock())
+            self._use_links_that_run(now)
             self._post_credential()  # it may have been renewed since they were made
-            woken = self._queue_outputs()
-        self._wake(woken)
         self._hooks.reach_changed()
 
     def _post_credential(self) -> None:
@@ -153,38 +153,28 @@ class ThreadedDataPlane:
 
     def submit(self, request_id: RequestId, service: ServiceName, payload: bytes) -> None:
         """Robot: send a serialised request."""
-        with self._lock:
-            self._engine.submit(request_id, service, payload, self._clock())
-            woken = self._queue_outputs()
-        self._wake(woken)
+        with self._turn as (engine, now):
+            engine.submit(request_id, service, payload, now)
 
     def judge_answer(self, request_id: RequestId, copy: int, problem: str | None) -> None:
         """Robot: note that this copy's answer was delivered to the application, or cannot be because of `problem`."""
-        with self._lock:
-            self._engine.judge_answer(request_id, copy, problem, self._clock())
-            woken = self._queue_outputs()
-        self._wake(woken)
+        with self._turn as (engine, now):
+            engine.judge_answer(request_id, copy, problem, now)
 
     def answered_here(self, request_id: RequestId) -> None:
         """Robot: note that the application got its answer on the robot."""
-        with self._lock:
-            self._engine.answered_here(request_id, self._clock())
-            woken = self._queue_outputs()
-        self._wake(woken)
+        with self._turn as (engine, now):
+            engine.answered_here(request_id, now)
 
     def complete(self, execution: ExecutionId, payload: bytes, processing_s: float) -> None:
         """Cloud: send the local server's answer."""
-        with self._lock:
-            self._engine.complete(execution, payload, processing_s, self._clock())
-            woken = self._queue_outputs()
-        self._wake(woken)
+        with self._turn as (engine, now):
+            engine.complete(execution, payload, processing_s, now)
 
     def refuse(self, execution: ExecutionId, reason: RejectReason, detail: str) -> None:
         """Cloud: refuse a request that was not or will not be answered."""
-        with self._lock:
-            self._engine.refuse(execution, reason, detail, self._clock())
-            woken = self._queue_outputs()
-        self._wake(woken)
+        with self._turn as (engine, now):
+            engine.refuse(execution, reason, detail, now)
 
     def set_offers(self, offers: tuple[ServiceOffer, ...]) -> None:
         """Cloud: replace the services that local servers offer right now."""
@@ -218,10 +208,8 @@ class ThreadedDataPlane:
     def apply_peers(self, peer_set: PeerSet) -> str | None:
         """Take a view of the peers; return why it is refused, or None."""
         self._judge(peer_set.peers)
-        with self._lock:
-            error = self._engine.apply_peers(peer_set, self._clock())
-            woken = self._queue_outputs()
-        self._wake(woken)
+        with self._turn as (engine, now):
+            error = engine.apply_peers(peer_set, now)
         self._log_peers()
         if error is None:
             self._hooks.reach_changed()
@@ -280,9 +268,8 @@ class ThreadedDataPlane:
 
     def set_revocations(self, numbers: Mapping[int, int], pem: bytes) -> None:
         """Tell peers about these lists, and send them when asked; see `RevocationExchange.set_own`."""
-        with self._lock:
-            self._engine.revocations.set_own(numbers, pem, self._clock())
-            self._timer.arm_at_latest(self._engine.next_timer())
+        with self._turn as (engine, now):
+            engine.revocations.set_own(numbers, pem, now)
 
     def judged_revocations(self, peer: NodeName, *, good: bool) -> None:
         """Note that a peer's lists were accepted, or are no lists of our CAs."""
@@ -310,10 +297,8 @@ class ThreadedDataPlane:
             self._recheck_peers(good)
 
     def _recheck_peers(self, judged: list[Peer]) -> None:
-        with self._lock:
-            taken = self._engine.recheck_peers(judged, self._clock())
-            woken = self._queue_outputs()
-        self._wake(woken)
+        with self._turn as (engine, now):
+            taken = engine.recheck_peers(judged, now)
         for name in taken:
             log.info("%s is talked to after all: its credential is good now", name)
         self._log_peers()
@@ -403,17 +388,13 @@ class ThreadedDataPlane:
 
     def on_link_events(self, events: list[LinkEvent]) -> None:
         """Take a link's events."""
-        engine = self._engine
         for first in range(0, len(events), EVENTS_A_TURN):
             if first:
                 time.sleep(YIELD_S)
-            now = self._clock()
-            with self._lock:
+            with self._turn as (engine, now):
                 for event in events[first : first + EVENTS_A_TURN]:
                     engine.on_link_event(event, now)
                 to_decode = engine.decodings
-                woken = self._queue_outputs()
-            self._wake(woken)
             if to_decode:
                 self._decoder.wake()
 
@@ -434,10 +415,8 @@ class ThreadedDataPlane:
 
     def on_decoded(self, decoding: Decoding) -> None:
         """Take a message whose decoding is complete."""
-        with self._lock:
-            self._engine.on_decoded(decoding, self._clock())
-            woken = self._queue_outputs()
-        self._wake(woken)
+        with self._turn as (engine, now):
+            engine.on_decoded(decoding, now)
 
     def on_decoding_failed(self, decoding: Decoding) -> None:
         """Give up a message that cannot be decoded."""
@@ -493,11 +472,6 @@ class ThreadedDataPlane:
         link = self._links.get(interface)
         return [] if link is None else [link]
 
-    @staticmethod
-    def _wake(links: set[InterfaceThread]) -> None:
-        for link in links:
-            link.wake()
-
     # -- the timer's thread ---------------------------------------------------------------------------------------
 
     def _run_timer(self) -> None:
@@ -514,13 +488,11 @@ class ThreadedDataPlane:
                 self._timer.wait()
 
     def _timer_turn(self) -> None:
-        with self._lock:
-            now = self._clock()
+        with self._turn as (engine, now):
             changed = self._look_for_hung_links(now)
-            self._engine.handle_timer(now)
-            woken = self._queue_outputs()
+            engine.handle_timer(now)
             if not self._stopping:
-                self._timer.arm(min(self._engine.next_timer(), now + LOOK_EVERY_S))
-        self._wake(woken)
+                # Before the outputs: what the application answers at once may have an earlier deadline.
+                self._timer.arm(min(engine.next_timer(), now + LOOK_EVERY_S))
         if changed:
             self._hooks.reach_changed()
