@@ -109,7 +109,7 @@ class Sidecar:
             if tls is None
             else Revocations(
                 tls,
-                self._data_plane,
+                self._data_plane.peer_trust,
                 self._store.remember_revocations,
                 lambda held: self._control.set_revocations(held),
                 config.max_revocation_age,
@@ -385,11 +385,11 @@ class Sidecar:
 
     def end_expired(self) -> None:
         """Drop peers whose certificates have expired by now."""
-        self._data_plane.end_expired(self._clock.now())
+        self._data_plane.peer_trust.end_expired(self._clock.now())
 
     def judge_again(self) -> None:
         """Judge refused peers again: time has passed or our clock was set, so they may be good now."""
-        self._data_plane.judge_again()
+        self._data_plane.peer_trust.judge_again()
 
     def certificate_changed(self, files: TlsFiles) -> None:
         """Sign this session's credential again with the new certificate files, which are in use now."""
@@ -398,7 +398,7 @@ class Sidecar:
         self._control_session.set_credential(credential.encode())
         with self._announcing:
             self._control.set_candidates(self._announcer.again())
-        self._data_plane.trust_changed()
+        self._data_plane.peer_trust.trust_changed()
         if self._revocations is not None:
             self._revocations.tell()
         log.info("took new certificate files from %s", files.directory)

@@ -33,7 +33,7 @@ CLOCK_SLACK_S = 300.0
 
 
 class RevocationUser(Protocol):
-    """The data plane's part in revocations."""
+    """The calls that `Revocations` makes to the data plane (`PeerTrust`)."""
 
     def trust_changed(self) -> None:
         """Judge all peers again."""
@@ -62,7 +62,7 @@ class Revocations:
     def __init__(
         self,
         tls: TlsWatch,
-        data_plane: RevocationUser,
+        user: RevocationUser,
         remember: Callable[[bytes], None],
         show: Callable[[RevocationSet], None],
         max_age_s: float = math.inf,
@@ -72,7 +72,7 @@ class Revocations:
         Peers of a CA whose list is older than `max_age_s` are not believed (`Trust.check`).
         """
         self._tls = tls
-        self._data_plane = data_plane
+        self._user = user
         self._remember = remember
         self._show = show
         self._max_age_s = max_age_s
@@ -103,7 +103,7 @@ class Revocations:
         shown = ", ".join(f"number {one.number}" for one in trust.lists().values() if one is not None)
         log.info("took a new revocation list of %s: %s", source, shown)
         self._remember(trust.crl_pem())
-        self._data_plane.trust_changed()
+        self._user.trust_changed()
         self.tell()
         return True
 
@@ -124,7 +124,7 @@ class Revocations:
         self._too_long = too_long
         self._say()
         numbers = {ca: -1 if one is None else one.number for ca, one in trust.lists().items()}
-        self._data_plane.set_revocations(numbers, b"" if too_long else pem)
+        self._user.set_revocations(numbers, b"" if too_long else pem)
 
     def _say(self) -> None:
         self._show(revocation_set(self._tls.current.trust.lists(), len(self._too_old)))
@@ -139,13 +139,13 @@ class Revocations:
         try:
             taken = self.take(pem, peer)
         except CertificateError as error:
-            self._data_plane.judged_revocations(peer, good=False)
+            self._user.judged_revocations(peer, good=False)
             if peer not in self._complained:
                 log.warning("a revocation list of %s is ignored, and it is not asked for an hour: %s", peer, error)
                 self._complained.add(peer)
             return
         if taken:
-            self._data_plane.judged_revocations(peer, good=True)
+            self._user.judged_revocations(peer, good=True)
 
     def _look_at_ages(self, now_wall: float) -> None:
         trust = self._tls.current.trust
@@ -170,4 +170,4 @@ class Revocations:
             log.warning("the revocation lists are new enough again: peers are talked to")
         self._too_old = too_old
         self._say()
-        self._data_plane.trust_changed()
+        self._user.trust_changed()

@@ -88,7 +88,7 @@ class LocalState:
         yield "idle", [name for name, carries in self.idle().items() if not carries]
         yield "control", self._control(now)
         yield from self._services(now)
-        refused = self.data_plane.refused_peers(MAX_REFUSED_PEERS)
+        refused = self.data_plane.peer_trust.refused(MAX_REFUSED_PEERS)
         yield "refused_peers", [{"name": name, "why": why} for name, why in refused]
         gone = self.data_plane.gone_paths(now - GONE_S, MAX_GONE)
         yield (

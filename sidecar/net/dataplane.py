@@ -7,30 +7,28 @@ thread that has news for the engine (a link's, a ROS thread) takes the lock, tel
 
 from __future__ import annotations
 
-import contextlib
 import logging
 import threading
 import time
 from dataclasses import dataclass
-from itertools import islice
 from typing import TYPE_CHECKING
 
-from plr.protos.base.errors import DecodeError
 from plr.sidecar.core.base.values import PathState
 from plr.sidecar.core.engine.engine import Engine, EngineConfig
 from plr.sidecar.core.link.pinging import Pong
 from plr.sidecar.core.seam.links import CheckPaths, Ping, ResetPaths, SendClose, SetCredential
 from plr.sidecar.net.decoder import Decoder
 from plr.sidecar.net.engine_turn import EngineTurn
+from plr.sidecar.net.peer_trust import PeerTrust
 from plr.sidecar.net.timerfd import Timer
 from plr.sidecar.net.watchdog import LOOK_EVERY_S, Watchdog
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Iterator, Mapping
+    from collections.abc import Callable, Iterator, Mapping
 
     from plr.protos.model.ids import InterfaceName, NodeName, ServiceName, SessionId
     from plr.protos.model.mapping import MappingSet, ServiceMapping
-    from plr.protos.model.members import Peer, PeerSet, ServiceOffer, ServiceUse
+    from plr.protos.model.members import PeerSet, ServiceOffer, ServiceUse
     from plr.protos.model.report import Report
     from plr.protos.trust.credential import SessionCredential
     from plr.sidecar.core.base.report_scope import ReportScope
@@ -88,16 +86,13 @@ class ThreadedDataPlane:
         self._engine = Engine(config, own, self._clock())
         self._lock = threading.RLock()  # the application may call us from its `handle`
         self._turn = EngineTurn(self._engine, self._lock, self._clock, self._queue_outputs)
+        self.peer_trust = PeerTrust(own, self._engine, self._lock, self._turn, hooks.reach_changed)
         self._links: dict[InterfaceName, InterfaceThread] = {}
         self._timer = Timer()
         self._decoder = Decoder(self)
         self._watchdog = Watchdog(self._clock())
         self._told_paths = self._engine.routes.best
         self._stopping = False
-        self._logged_refusals: dict[NodeName, str] = {}
-        """Peer -> the cause logged last."""
-        self._logged_candidates: dict[NodeName, str] = {}
-        self._logged_conflicts: frozenset[tuple[ServiceName, NodeName, str]] = frozenset()
         self._timer_thread = threading.Thread(target=self._run_timer, name="plr-timer", daemon=True)
 
     # -- life -----------------------------------------------------------------------------------------------------
@@ -207,102 +202,13 @@ class ThreadedDataPlane:
 
     def apply_peers(self, peer_set: PeerSet) -> str | None:
         """Take a view of the peers; return why it is refused, or None."""
-        self._judge(peer_set.peers)
+        self.peer_trust.judge(peer_set.peers)
         with self._turn as (engine, now):
             error = engine.apply_peers(peer_set, now)
-        self._log_peers()
+        self.peer_trust.log_news()
         if error is None:
             self._hooks.reach_changed()
         return error
-
-    def _log_peers(self) -> None:
-        """Log news about peers that are not talked to, or get no requests."""
-        with self._lock:
-            conflicts = self._engine.offer_conflicts
-            refused = list(self._engine.peers.refused.values())
-            ignored = dict(self._engine.peers.ignored_candidates)
-            used_again = [name for name in self._logged_candidates.keys() - ignored if name in self._engine.peers]
-        for refusal in refused:
-            if self._logged_refusals.get(refusal.peer.name) != refusal.cause:
-                name, why = refusal.peer.name, refusal.why
-                log.warning("%s is not talked to, whatever the control plane says: %s", name, why)
-        self._logged_refusals = {refusal.peer.name: refusal.cause for refusal in refused}
-        for name, why in ignored.items():
-            if self._logged_candidates.get(name) != why:
-                log.warning("%s: what the control plane tells of its addresses is not used: %s", name, why)
-        for name in used_again:
-            log.info("%s: what the control plane tells of its addresses is used again", name)
-        self._logged_candidates = ignored
-        for service, server, kind in sorted(conflicts - self._logged_conflicts):
-            log.warning(
-                "%s at %s has type %s, unlike the configuration or the other servers: it gets no requests",
-                service,
-                server,
-                kind,
-            )
-        self._logged_conflicts = conflicts
-
-    def _judge(self, peers: Iterable[Peer]) -> list[Peer]:
-        """Do the public-key work for these peers before the engine, under its lock, asks for the result.
-
-        Return the good ones.
-        """
-        good = []
-        for peer in peers:
-            with contextlib.suppress(DecodeError):
-                self._own.admit(peer)
-                good.append(peer)
-                self._own.check_candidates(peer)
-        return good
-
-    def trust_changed(self) -> None:
-        """Follow a change of CAs or revocations: peers that are no longer trusted lose their sessions at once.
-
-        Refused peers may be good now.
-        """
-        self._own.forget_admitted()
-        with self._lock:
-            known, refused = self._engine.peers.all(), self._engine.peers.all_refused()
-        self._judge(known)
-        self._recheck_peers(self._judge(refused))
-
-    def set_revocations(self, numbers: Mapping[int, int], pem: bytes) -> None:
-        """Tell peers about these lists, and send them when asked; see `RevocationExchange.set_own`."""
-        with self._turn as (engine, now):
-            engine.revocations.set_own(numbers, pem, now)
-
-    def judged_revocations(self, peer: NodeName, *, good: bool) -> None:
-        """Note that a peer's lists were accepted, or are no lists of our CAs."""
-        with self._lock:
-            self._engine.revocations.on_judged(peer, self._clock(), good=good)
-
-    def end_expired(self, now_wall: float) -> None:
-        """Drop peers whose certificates have ended by now (seconds since 1970); nearly free if there are none.
-
-        Log which other peers are not talked to any more.
-        """
-        if self._own.forget_ended(now_wall):
-            with self._lock:
-                known = self._engine.peers.all()
-            self._judge(known)
-            self._recheck_peers([])
-        self._log_peers()
-
-    def judge_again(self) -> None:
-        """Judge refused peers again: time has passed, or our clock was set, and they may be good now."""
-        with self._lock:
-            refused = self._engine.peers.all_refused()
-        good = self._judge(refused)
-        if good:
-            self._recheck_peers(good)
-
-    def _recheck_peers(self, judged: list[Peer]) -> None:
-        with self._turn as (engine, now):
-            taken = engine.recheck_peers(judged, now)
-        for name in taken:
-            log.info("%s is talked to after all: its credential is good now", name)
-        self._log_peers()
-        self._hooks.reach_changed()
 
     def renew_credential(self, credential: SessionCredential) -> None:
         """Use this session's credential, signed with our renewed certificate.
@@ -345,12 +251,6 @@ class ThreadedDataPlane:
     def paths_to(self, peer: str) -> list[PathId]:
         """Return the links' paths to a peer, whatever their state; takes no lock."""
         return [path for link in list(self._links.values()) for path in link.link.paths_to(peer)]
-
-    def refused_peers(self, at_most: int) -> list[tuple[NodeName, str]]:
-        """Return the peers that are not talked to, and why."""
-        with self._lock:
-            refused = list(islice(self._engine.peers.refused.values(), at_most))
-        return [(refusal.peer.name, refusal.why) for refusal in refused]
 
     def path_views(self, now: float) -> Iterator[tuple[PathView, Change | None]]:
         """Yield each path's state and its last change; takes no lock, and may be paused between two."""

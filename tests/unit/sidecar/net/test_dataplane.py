@@ -248,7 +248,7 @@ def test_a_peer_that_trust_no_longer_covers_loses_its_session_at_once(nodes: tup
         raise DecodeError(f"{credential.name} is revoked")
 
     robot.own._verify = judge
-    robot.plane.trust_changed()
+    robot.plane.peer_trust.trust_changed()
     assert robot.plane.engine_stats.dropped["bad_credential"] == 1
     assert cloud.name not in robot.plane._engine.peers
 
@@ -272,12 +272,12 @@ def test_a_peer_refused_while_the_clock_was_wrong_is_talked_to_when_it_is_right(
             stack.callback(node.stop)
             node.start(other)
         for _ in range(3):
-            robot.plane.judge_again()
-            robot.plane.trust_changed()
+            robot.plane.peer_trust.judge_again()
+            robot.plane.peer_trust.trust_changed()
         assert caplog.text.count("is not talked to") == 1
         assert cloud.name not in robot.plane._engine.peers
         wrong = False
-        robot.plane.judge_again()
+        robot.plane.peer_trust.judge_again()
         robot.wait_for(OfferService)
         submit(robot, 1, b"at last")
         robot.wait_for(ResponseArrived)
@@ -290,10 +290,10 @@ def test_a_peer_of_a_ca_that_is_copied_late_is_talked_to_from_then_on(nodes: tup
         raise CertificateError(UNTRUSTED, "the certificate is of another CA")
 
     believe, robot.own._verify = robot.own._verify, judge
-    robot.plane.trust_changed()
+    robot.plane.peer_trust.trust_changed()
     assert cloud.name not in robot.plane._engine.peers
     robot.own._verify = believe
-    robot.plane.trust_changed()
+    robot.plane.peer_trust.trust_changed()
     assert cloud.name in robot.plane._engine.peers
     submit(robot, 1, b"again")
     robot.wait_for(ResponseArrived)
@@ -341,7 +341,7 @@ def test_tells_when_interfaces_or_peers_are_others(nodes: tuple[Node, Node], mon
     assert told()
     robot.plane.apply_peers(PeerSet(Version(3), 1, (cloud.told_to(robot),) * (MAX_PEERS + 1)))
     assert not told(), "refused"
-    robot.plane.trust_changed()
+    robot.plane.peer_trust.trust_changed()
     assert told()
     for hangs in (True, False):
         monkeypatch.setattr(robot.thread, "in_turn_for", lambda now, hangs=hangs: 1.0 if hangs else 0.0)
