@@ -50,7 +50,6 @@ if TYPE_CHECKING:
     from plr.sidecar.core.base.report_scope import ReportScope
     from plr.sidecar.core.base.values import PathState
     from plr.sidecar.core.link.pinging import Pong
-    from plr.sidecar.core.stun.events import StunEvent
     from plr.sidecar.stop_request import StopRequest
 
 log = logging.getLogger(__name__)
@@ -95,7 +94,6 @@ class Sidecar:
             own,
             DataPlaneHooks(
                 self._bridge,
-                self._on_stun,
                 self._on_services_changed,
                 self._on_reach_changed,
                 self._on_paths_changed,
@@ -303,9 +301,6 @@ class Sidecar:
         hosts = [split_host_port(address)[0] for address in self._config.control_plane]
         shown = [f"[{host}]" if ":" in host else host for host in dict.fromkeys(hosts)]
         return tuple(f"{host}:{DEFAULT_STUN_PORT}" for host in shown)
-
-    def _on_stun(self, interface: InterfaceName, event: StunEvent) -> None:
-        self._interfaces.on_stun_event(interface, event)
 
     def _tell_candidates(self, candidates: tuple[Candidate, ...], down: tuple[InterfaceName, ...]) -> None:
         with self._announcing:

@@ -39,7 +39,6 @@ if TYPE_CHECKING:
     from plr.sidecar.core.path.view import PathView
     from plr.sidecar.core.seam.links import LinkEvent
     from plr.sidecar.core.seam.stats import EngineStats, LinkStats
-    from plr.sidecar.core.stun.events import StunEvent
     from plr.sidecar.net.interface_thread import InterfaceThread
     from plr.sidecar.ports import Application
 
@@ -61,7 +60,6 @@ class DataPlaneHooks:
     """Callbacks of the data plane."""
 
     application: Application
-    stun: Callable[[InterfaceName, StunEvent], None]
     services_changed: Callable[[], None]
     """Offers or uses may have changed, which the control plane has to know."""
     reach_changed: Callable[[], None]
@@ -297,10 +295,6 @@ class ThreadedDataPlane:
                 to_decode = engine.decodings
             if to_decode:
                 self._decoder.wake()
-
-    def on_stun_event(self, interface: InterfaceName, event: StunEvent) -> None:
-        """Take a STUN event."""
-        self._hooks.stun(interface, event)
 
     def on_pong(self, pong: Pong) -> None:
         """Take the result of a ping."""

@@ -167,7 +167,7 @@ class InterfaceManager:
             for one, interface in managed
         ]
 
-    def on_stun_event(self, interface: InterfaceName, event: StunEvent) -> None:
+    def _on_stun(self, interface: InterfaceName, event: StunEvent) -> None:
         """Take a STUN event; called on the interface's thread."""
         with self._lock:
             managed = self._managed.get(interface)
@@ -296,7 +296,14 @@ class InterfaceManager:
             servers = self._stun_servers if self._config.stun.enabled else None
             try:
                 managed = ManagedInterface(
-                    interface, self._config.udp_port, identity, number.memory, self._limits, servers, self._data_plane
+                    interface,
+                    self._config.udp_port,
+                    identity,
+                    number.memory,
+                    self._limits,
+                    servers,
+                    self._data_plane,
+                    self._on_stun,
                 )
             except OSError as error:
                 self._socket_refused = True

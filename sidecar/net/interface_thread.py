@@ -55,9 +55,6 @@ class LinkOwner(Protocol):
     def on_link_events(self, events: list[LinkEvent]) -> None:
         """Take the link's events; called on the link's thread."""
 
-    def on_stun_event(self, interface: InterfaceName, event: StunEvent) -> None:
-        """Take a STUN event; called on the link's thread."""
-
     def on_pong(self, pong: Pong) -> None:
         """Take the result of a ping; called on the link's thread, which must not wait there."""
 
@@ -71,13 +68,16 @@ class InterfaceThread:
         link: Link,
         stun: StunClient | None,
         owner: LinkOwner,
+        on_stun: Callable[[StunEvent], None] = lambda _: None,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
+        """Report to `owner`, and STUN events to `on_stun`; both are called on the thread."""
         self.link = link
         self.port: int = sock.getsockname()[1]
         self._socket = sock
         self._stun = stun
         self._owner = owner
+        self._on_stun = on_stun
         self._clock = clock
         self._inbox: deque[LinkCommand | Callable[[StunClient], None]] = deque()
         self._waiter = Waiter(sock.fileno(), clock)
@@ -257,7 +257,7 @@ class InterfaceThread:
             self._batches.send(Batch(address, data, len(data)))  # what finds no room is retransmitted in time
             self.link.stats.datagrams["sent", "stun"] += 1
         while (event := stun.next_event()) is not None:
-            self._owner.on_stun_event(self.interface, event)
+            self._on_stun(event)
 
     def _send(self) -> None:
         self._more = True

@@ -9,6 +9,7 @@ from __future__ import annotations
 import logging
 import random
 import time
+from functools import partial
 from typing import TYPE_CHECKING
 
 from plr.protos.model.members import Candidate, CandidateKind
@@ -21,13 +22,14 @@ from plr.sidecar.net.interface_thread import InterfaceThread
 from plr.sidecar.net.sockets import BoundTo, open_socket
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
+    from collections.abc import Callable, Iterable
 
     from plr.protos.model.ids import Address, InterfaceName
     from plr.sidecar.core.link.memory import LinkMemory
     from plr.sidecar.core.link.sender import LinkIdentity
     from plr.sidecar.core.path.key_exchange import KeyLimits
     from plr.sidecar.core.seam.links import Rebind
+    from plr.sidecar.core.stun.events import StunEvent
     from plr.sidecar.net.interface_thread import LinkOwner
     from plr.sidecar.net.interfaces import Interface
 
@@ -48,8 +50,12 @@ class ManagedInterface:
         limits: KeyLimits,
         stun_servers: Iterable[Address] | None,
         owner: LinkOwner,
+        on_stun: Callable[[InterfaceName, StunEvent], None],
     ) -> None:
-        """Open the socket, which may raise OSError. `stun_servers` is None when STUN is off."""
+        """Open the socket, which may raise OSError. `stun_servers` is None when STUN is off.
+
+        The interface's thread reports to `owner`, and STUN events to `on_stun`.
+        """
         self.interface = interface
         self.suspended = False
         self.reflexive: dict[int, Address] = {}
@@ -62,7 +68,7 @@ class ManagedInterface:
         if stun_servers is not None:
             stun = StunClient(stun_servers, random.SystemRandom(), drops=link.stats.dropped)
             stun.start(time.monotonic())
-        self.thread = InterfaceThread(opened.socket, link, stun, owner)
+        self.thread = InterfaceThread(opened.socket, link, stun, owner, partial(on_stun, interface.name))
         self._tell_mtu(interface)
 
     @property

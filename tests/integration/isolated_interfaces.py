@@ -96,7 +96,7 @@ class Robot:
         services = [ServiceName(service) for service in mapping]
         deadline_s = dict.fromkeys(services, LIFETIME_S) | {services[0]: URGENT_S}
         rules = tuple(ServiceRule(service, deadline_s[service], LIFETIME_S) for service in services)
-        hooks = DataPlaneHooks(self, lambda *_: None, lambda: None, lambda: None, lambda _: None, lambda *_: None)
+        hooks = DataPlaneHooks(self, lambda: None, lambda: None, lambda _: None, lambda *_: None)
         own = session_of("robot", Role.ROBOT, SESSION)
         self.plane = ThreadedDataPlane(EngineConfig(Role.ROBOT, rules), own, hooks)
         self.sockets: dict[str, BadSocket] = {}

@@ -73,9 +73,7 @@ class EngineProgram:
         interpreter.share()
         self._own = start_session(parsed.node_name, parsed.role, 1, None, ClockFloor(time.time))
         self._token = random.randbytes(16)
-        hooks = DataPlaneHooks(
-            self, lambda _interface, _event: None, lambda: None, lambda: None, lambda _: None, lambda *_: None
-        )
+        hooks = DataPlaneHooks(self, lambda: None, lambda: None, lambda _: None, lambda *_: None)
         self._plane = ThreadedDataPlane(EngineConfig(parsed.role, parsed.service_rules()), self._own, hooks)
         self._interfaces = InterfaceManager(parsed, self._own, self._token, self._plane, self._on_candidates)
         self._plane.start()

@@ -58,7 +58,6 @@ class Node:
         self.pongs: queue.SimpleQueue[Pong] = queue.SimpleQueue()
         hooks = DataPlaneHooks(
             self,
-            lambda *_: None,
             lambda: None,
             self.count_reach,
             lambda _: None,

@@ -46,9 +46,7 @@ class Application:
 @pytest.mark.audit("dp-10")
 def test_messages_are_decoded_on_no_interfaces_thread_while_nothing_is_locked(monkeypatch: pytest.MonkeyPatch) -> None:
     application = Application()
-    hooks = DataPlaneHooks(
-        application, lambda _interface, _event: None, lambda: None, lambda: None, lambda _: None, lambda *_: None
-    )
+    hooks = DataPlaneHooks(application, lambda: None, lambda: None, lambda _: None, lambda *_: None)
     plane = ThreadedDataPlane(EngineConfig(Role.CLOUD, (rule(),)), session_of("me", Role.CLOUD, 9), hooks)
     plane.set_offers((ServiceOffer(ECHO, TYPE),))
     assert plane.apply_peers(PeerSet(Version(1), 1, (peer("robot"),))) is None

@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING, Any
 from plr.protos.model.ids import InterfaceId, InterfaceName, Role
 from plr.sidecar.core.link.link import Link
 from plr.sidecar.core.link.sender import Batch, LinkIdentity
+from plr.sidecar.core.stun.client import StunClient
+from plr.sidecar.core.stun.events import Mapped
 from plr.sidecar.net.interface_thread import InterfaceThread
 from tests.support.sessions import credential_of
 
@@ -26,9 +28,6 @@ class Owner:
     """Nobody's engine."""
 
     def on_link_events(self, events: list[LinkEvent]) -> None:
-        pass
-
-    def on_stun_event(self, interface: InterfaceName, event: StunEvent) -> None:
         pass
 
     def on_pong(self, pong: Pong) -> None:
@@ -53,11 +52,15 @@ class SlowSocket(socket.socket):
         return 1
 
 
-def thread_with(sock: socket.socket, waiting: int) -> InterfaceThread:
-    """A thread that has so many datagrams to send."""
+def a_link() -> Link:
     credential = credential_of("robot", Role.ROBOT, 1)
     identity = LinkIdentity.of(credential, bytes(16), InterfaceName("wlan0"), InterfaceId(0))
-    thread = InterfaceThread(sock, Link(identity, random.Random(1), time.monotonic()), None, Owner())
+    return Link(identity, random.Random(1), time.monotonic())
+
+
+def thread_with(sock: socket.socket, waiting: int) -> InterfaceThread:
+    """A thread that has so many datagrams to send."""
+    thread = InterfaceThread(sock, a_link(), None, Owner())
     thread._unsent.extend(Batch(("127.0.0.1", 9), b"x", 1) for _ in range(waiting))
     return thread
 
@@ -102,3 +105,13 @@ def test_what_still_waits_leaves_before_the_thread_ends() -> None:
     thread.start()
     thread.stop(PATIENCE_S)
     assert sock.sends == 5
+
+
+def test_stun_events_go_to_who_asked_for_them(monkeypatch: pytest.MonkeyPatch) -> None:
+    events: list[StunEvent] = []
+    stun = StunClient((), random.Random(1))
+    mapped = Mapped(4, ("192.0.2.1", 9), ("192.0.2.2", 3478))
+    monkeypatch.setattr(stun, "next_event", iter([mapped, None]).__next__)
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock:
+        InterfaceThread(sock, a_link(), stun, Owner(), events.append)._stun_turn()
+    assert events == [mapped]
