@@ -1,4 +1,4 @@
-"""Defines the seam between the ROS bridge and the data plane: what each may call of the other."""
+"""Defines the seams of the data plane: to the ROS bridge (both directions), and to the control client."""
 
 from __future__ import annotations
 
@@ -8,7 +8,10 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from plr.protos.model.ids import ServiceName, SessionId
-    from plr.protos.model.members import ServiceOffer
+    from plr.protos.model.mapping import MappingSet
+    from plr.protos.model.members import PeerSet, ServiceOffer
+    from plr.protos.model.report import Report
+    from plr.sidecar.core.base.report_scope import ReportScope
     from plr.sidecar.core.base.values import ExecutionId, RejectReason, RequestId
     from plr.sidecar.core.seam.application import ApplicationEvent
 
@@ -46,6 +49,19 @@ class DataPlane(Protocol):
 
         The value says whether the service's fallback can be called; None where it has none.
         """
+
+
+class ControlledDataPlane(Protocol):
+    """The calls open to the control client, from any thread; they may wait for the engine's lock."""
+
+    def apply_peers(self, peer_set: PeerSet) -> str | None:
+        """Put the peers in force; return why they are refused, or None."""
+
+    def apply_mapping(self, mapping: MappingSet) -> str | None:
+        """Put the mapping in force; return why it is refused, or None."""
+
+    def take_report(self, scope: ReportScope) -> Report:
+        """Return what was measured since the last call."""
 
 
 class Application(Protocol):

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 from plr.protos.base.errors import StartError
 from plr.protos.base.host_port import split_host_port
 from plr.protos.model.ids import OLDEST_PROTOCOL_VERSION, PROTOCOL_VERSION, Role, ServiceName, Version
+from plr.protos.model.mapping import MappingSet
 from plr.protos.model.members import MAX_UNMET, CandidateKind, Registration, ServiceSet
 from plr.protos.model.stream import ResourceKind
 from plr.protos.program import interpreter
@@ -40,14 +41,12 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from plr.protos.model.ids import InterfaceName, NodeName
-    from plr.protos.model.mapping import Assignment, MappingSet
+    from plr.protos.model.mapping import Assignment
     from plr.protos.model.members import Candidate, PeerSet
-    from plr.protos.model.report import Report
     from plr.protos.model.stream import Welcome
     from plr.protos.program.metrics_server import MetricsServer
     from plr.protos.program.tls_files import TlsFiles
     from plr.sidecar.config.sidecar import SidecarConfig
-    from plr.sidecar.core.base.report_scope import ReportScope
     from plr.sidecar.core.base.values import PathState
     from plr.sidecar.core.link.pinging import Pong
     from plr.sidecar.stop_request import StopRequest
@@ -140,7 +139,7 @@ class Sidecar:
             lambda addresses: self._store.remember_addresses(names, addresses),
             self._data_plane.check_paths,
         )
-        self._control = ControlClient(self._dialer, self._control_session, self, self._tls)
+        self._control = ControlClient(self._dialer, self._control_session, self._data_plane, self, self._tls)
         self._interfaces = InterfaceManager(
             config,
             own,
@@ -344,21 +343,12 @@ class Sidecar:
         self._store.remember(replace(welcome, crl=b""))
         self._interfaces.set_stun_servers(self._stun_servers(welcome))
 
-    def apply_peers(self, peers: PeerSet) -> str | None:
-        """Put the peers in force; return why that failed, or None."""
-        error = self._data_plane.apply_peers(peers)
-        if error is None:
-            self._store.remember(peers)
-        return error
-
-    def apply_mapping(self, mapping: MappingSet) -> str | None:
-        """Put the mapping in force; return why that failed, or None."""
-        error = self._data_plane.apply_mapping(mapping)
-        if error is None:
+    def applied(self, content: PeerSet | MappingSet) -> None:
+        """Remember what is in force, and log what a mapping changes."""
+        self._store.remember(content)
+        if isinstance(content, MappingSet):
             self._mapping_origin = MappingOrigin("control plane", time.monotonic())
-            self._store.remember(mapping)
-            self._log_changes(mapping)
-        return error
+            self._log_changes(content)
 
     def _log_changes(self, mapping: MappingSet) -> None:
         for service in mapping.services:
@@ -366,10 +356,6 @@ class Sidecar:
                 pairs = ", ".join(f"{pair.interface} to {pair.server}" for pair in service.assignments)
                 log.info("mapping %d: %s goes %s: %s", mapping.version, service.service, pairs, service.reason)
         self._logged_mappings = {service.service: service.assignments for service in mapping.services}
-
-    def take_report(self, scope: ReportScope) -> Report:
-        """Return what was measured since the last call."""
-        return self._data_plane.take_report(scope)
 
     def look_at_revocations(self) -> None:
         """Judge the revocation lists that peers sent, and the age of those in use; called every second."""

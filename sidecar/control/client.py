@@ -33,7 +33,7 @@ from plr.sidecar.core.control.session import Apply
 from plr.sidecar.core.control.watch import CHEAPER
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Iterator
 
     from plr.protos.model.members import CandidateSet, RevocationSet
     from plr.protos.plr.v1 import control_pb2
@@ -42,6 +42,7 @@ if TYPE_CHECKING:
     from plr.sidecar.core.base.report_scope import ReportScope
     from plr.sidecar.core.control.session import ControlSession, ControlStats
     from plr.sidecar.net.control_dialer import ControlDialer, ControlLine
+    from plr.sidecar.ports import ControlledDataPlane
 
     _Call = grpc.aio.StreamStreamCall[control_pb2.SidecarMessage, control_pb2.ControlMessage]
 
@@ -96,12 +97,18 @@ class ControlClient:
     """
 
     def __init__(
-        self, dialer: ControlDialer, session: ControlSession, hooks: ControlHooks, tls: TlsWatch | None = None
+        self,
+        dialer: ControlDialer,
+        session: ControlSession,
+        data_plane: ControlledDataPlane,
+        hooks: ControlHooks,
+        tls: TlsWatch | None = None,
     ) -> None:
         self._dialer = dialer
         self._line: ControlLine | None = None
         self._tls = tls
         self._session = session
+        self._data_plane = data_plane
         self._hooks = hooks
         self._connected = False
         self.last_failure: str | None = None
@@ -236,7 +243,7 @@ class ControlClient:
         again_at = time.monotonic() + JUDGE_AGAIN_S
         while True:
             await asyncio.sleep(min(LOOK_INTERVAL_S, JUDGE_AGAIN_S))
-            try:
+            with _logging_failure("judging credentials"):
                 if self._look_for_new_files():
                     self._new_files.set()
                 self._hooks.look_at_revocations()
@@ -244,8 +251,6 @@ class ControlClient:
                 if time.monotonic() >= again_at:
                     again_at = time.monotonic() + JUDGE_AGAIN_S
                     self._hooks.judge_again()
-            except Exception:
-                log.exception("judging credentials failed")
 
     def _begin_stop(self) -> None:
         self._stopping = True
@@ -317,10 +322,8 @@ class ControlClient:
         files = self._tls.poll() if self._tls is not None else None
         if files is None:
             return False
-        try:
+        with _logging_failure("certificate_changed"):
             self._hooks.certificate_changed(files)
-        except Exception:
-            log.exception("certificate_changed failed")
         return True
 
     def _ended_by(self, error: grpc.aio.AioRpcError) -> _StreamEndedError:
@@ -397,10 +400,8 @@ class ControlClient:
         if not self._connected and self._line is not None:
             self._line.let_in()
             self._outage.over(str(self._line.way))
-        try:
+        with _logging_failure("welcome"):
             self._hooks.welcome(welcome)
-        except Exception:
-            log.exception("welcome failed")
         self._note_connection(True, "registered")
 
     def _apply(self, apply: Apply) -> None:
@@ -417,10 +418,14 @@ class ControlClient:
         content = apply.content
         try:
             if isinstance(content, PeerSet):
-                return self._hooks.apply_peers(content), None
-            return self._hooks.apply_mapping(content), None
+                error = self._data_plane.apply_peers(content)
+            else:
+                error = self._data_plane.apply_mapping(content)
+            if error is None:
+                self._hooks.applied(content)
         except Exception as failure:
             return f"internal error: {failure}", failure
+        return error, None
 
     def _try_refused(self) -> None:
         apply = self._session.refused
@@ -430,20 +435,26 @@ class ControlClient:
             log.info("%s version %d fits now", apply.resource.value, apply.content.version)
 
     def _take_report(self, scope: ReportScope) -> Report:
-        try:
-            return self._hooks.take_report(scope)
-        except Exception:
-            log.exception("taking a report failed")
-            return Report()
+        report = Report()
+        with _logging_failure("taking a report"):
+            report = self._data_plane.take_report(scope)
+        return report
 
     def _note_connection(self, connected: bool, reason: str) -> None:
         if connected == self._connected:
             return
         self._connected, self._changed_at = connected, time.monotonic()
-        try:
+        with _logging_failure("connection_changed"):
             self._hooks.connection_changed(connected, reason)
-        except Exception:
-            log.exception("connection_changed failed")
+
+
+@contextlib.contextmanager
+def _logging_failure(what: str) -> Iterator[None]:
+    """Log an internal error of the rest of the sidecar, which must not end the stream."""
+    try:
+        yield
+    except Exception:
+        log.exception("%s failed", what)
 
 
 def _most_telling(group: BaseExceptionGroup[_StreamEndedError]) -> _StreamEndedError:

@@ -7,10 +7,8 @@ from typing import TYPE_CHECKING, Protocol
 if TYPE_CHECKING:
     from plr.protos.model.mapping import MappingSet
     from plr.protos.model.members import PeerSet
-    from plr.protos.model.report import Report
     from plr.protos.model.stream import Welcome
     from plr.protos.program.tls_files import TlsFiles
-    from plr.sidecar.core.base.report_scope import ReportScope
 
 
 class ControlHooks(Protocol):
@@ -19,14 +17,8 @@ class ControlHooks(Protocol):
     def welcome(self, welcome: Welcome) -> None:
         """Take the welcome of an accepted stream, which also names the STUN servers."""
 
-    def apply_peers(self, peers: PeerSet) -> str | None:
-        """Put the peers in force; return why that failed, or None."""
-
-    def apply_mapping(self, mapping: MappingSet) -> str | None:
-        """Put the mapping in force; return why that failed, or None."""
-
-    def take_report(self, scope: ReportScope) -> Report:
-        """Return what was measured since the last call."""
+    def applied(self, content: PeerSet | MappingSet) -> None:
+        """Note that the data plane has put these peers or this mapping in force."""
 
     def connection_changed(self, connected: bool, reason: str) -> None:
         """Note that the control plane was reached or lost."""

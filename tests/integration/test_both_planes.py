@@ -38,14 +38,17 @@ class Engine:
     def welcome(self, welcome: Welcome) -> None:
         """Nothing to do."""
 
-    def apply_peers(self, peers: PeerSet) -> str | None:
-        self.known = tuple(peer.name for peer in peers.peers)
-        self.peers.put(peers)
+    def apply_peers(self, peer_set: PeerSet) -> str | None:
+        self.known = tuple(peer.name for peer in peer_set.peers)
+        self.peers.put(peer_set)
         return None
 
     def apply_mapping(self, mapping: MappingSet) -> str | None:
         self.mappings.put(mapping)
         return None
+
+    def applied(self, content: PeerSet | MappingSet) -> None:
+        """Nothing to remember."""
 
     def take_report(self, scope: ReportScope) -> Report:
         return Report(paths=tuple(path(nic, server) for nic in ("wlan0", "wwan0") for server in self.known))
@@ -74,7 +77,7 @@ def test_a_client_registers_follows_and_outlives_a_restart(tmp_path: Path) -> No
     engine = Engine()
     session = ControlSession(registration("robot", Role.ROBOT), random.Random(1))
     with ControlPlaneProcess(tmp_path, lease_ms=10_000) as plane:
-        client = ControlClient(ControlDialer((plane.address,), session.stats), session, engine)
+        client = ControlClient(ControlDialer((plane.address,), session.stats), session, engine, engine)
         client.set_candidates(CandidateSet(interfaces("wlan0", "wwan0")))
         client.set_services(ServiceSet((), (use(),)))
         client.start()

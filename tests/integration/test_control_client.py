@@ -62,11 +62,11 @@ OFFER = ServiceOffer(ServiceName("/plan"), "nav_msgs/srv/GetPlan")
 
 
 class Recorder:
-    """Hooks that note what they are told."""
+    """A data plane and hooks that note what they are told."""
 
     def __init__(self) -> None:
         self.welcomes: list[Welcome] = []
-        self.applied: list[PeerSet | MappingSet] = []
+        self.in_force: list[PeerSet | MappingSet] = []
         self.connection: queue.Queue[tuple[bool, str]] = queue.Queue()
         self.report = Report()
         self.error: str | None = None
@@ -76,15 +76,16 @@ class Recorder:
     def welcome(self, welcome: Welcome) -> None:
         self.welcomes.append(welcome)
 
-    def apply_peers(self, peers: PeerSet) -> str | None:
+    def apply_peers(self, peer_set: PeerSet) -> str | None:
         if self.crash:
             raise RuntimeError("broken engine")
-        if self.error is None:
-            self.applied.append(peers)
         return self.error
 
     def apply_mapping(self, mapping: MappingSet) -> str | None:
         return self.apply_peers(PeerSet(mapping.version, mapping.nonce))
+
+    def applied(self, content: PeerSet | MappingSet) -> None:
+        self.in_force.append(content)
 
     def take_report(self, scope: ReportScope) -> Report:
         if self.crash:
@@ -128,7 +129,7 @@ class Rig:
         )
         self.hooks = Recorder()
         session = ControlSession(registration, random.Random(1))
-        self.client = ControlClient(ControlDialer(targets, session.stats), session, self.hooks)
+        self.client = ControlClient(ControlDialer(targets, session.stats), session, self.hooks, self.hooks)
 
 
 @pytest.fixture
@@ -168,7 +169,7 @@ def test_applies_and_acks(server: ScriptedControlPlane, rig: Rig) -> None:
     assert server.expect(Ack) == Ack(ResourceKind.PEERS, Version(41), 5)
     server.say(MappingSet(Version(7), nonce=6))
     assert server.expect(Ack) == Ack(ResourceKind.MAPPING, Version(7), 6)
-    assert [content.version for content in rig.hooks.applied] == [41, 7]
+    assert [content.version for content in rig.hooks.in_force] == [41, 7]
 
 
 def test_what_the_engine_refuses_is_nacked(
@@ -198,13 +199,13 @@ def test_a_refused_mapping_is_tried_again_when_the_sidecar_has_news(server: Scri
     assert server.expect(Nack).nonce == 6, "what fails again is not said again"
     rig.hooks.error = None
     rig.client.try_again()
-    wait_for(lambda: rig.hooks.applied)
+    wait_for(lambda: rig.hooks.in_force)
     server.say(MappingSet(Version(9), nonce=7))
     assert server.expect(Ack) == Ack(ResourceKind.MAPPING, Version(9), 7)
     rig.client.try_again()
     server.say(PeerSet(Version(41), nonce=8))
     server.expect(Ack)
-    assert [content.version for content in rig.hooks.applied] == [8, 9, 41], "the newest only, and once"
+    assert [content.version for content in rig.hooks.in_force] == [8, 9, 41], "the newest only, and once"
 
 
 def test_a_crash_of_the_engine_becomes_a_nack_and_the_stream_goes_on(server: ScriptedControlPlane, rig: Rig) -> None:

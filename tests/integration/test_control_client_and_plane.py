@@ -103,7 +103,7 @@ class Sidecar:
             software_version="test",
         )
         self.session = ControlSession(registration, random.Random(number))
-        self.client = ControlClient(ControlDialer((f"127.0.0.1:{port}",), self.session.stats), self.session, self)
+        self.client = ControlClient(ControlDialer((f"127.0.0.1:{port}",), self.session.stats), self.session, self, self)
         self.peers: queue.Queue[PeerSet] = queue.Queue()
         self.mappings: queue.Queue[MappingSet] = queue.Queue()
         self.connection: queue.Queue[bool] = queue.Queue()
@@ -116,13 +116,16 @@ class Sidecar:
     def welcome(self, welcome: Welcome) -> None:
         assert welcome.lease_s == 1.5
 
-    def apply_peers(self, peers: PeerSet) -> str | None:
-        self.peers.put(peers)
+    def apply_peers(self, peer_set: PeerSet) -> str | None:
+        self.peers.put(peer_set)
         return None
 
     def apply_mapping(self, mapping: MappingSet) -> str | None:
         self.mappings.put(mapping)
         return self.refuse
+
+    def applied(self, content: PeerSet | MappingSet) -> None:
+        """Nothing to remember."""
 
     def take_report(self, scope: ReportScope) -> Report:
         return self.report

@@ -65,7 +65,7 @@ class Robot:
             self.claim(self.tls.current)
         self.announcer: Announcer | None = None
         """Signs what it announces of itself, if it does."""
-        self.client = ControlClient(ControlDialer((address,), self.session.stats), self.session, self, self.tls)
+        self.client = ControlClient(ControlDialer((address,), self.session.stats), self.session, self, self, self.tls)
         self.welcomes: queue.Queue[Welcome] = queue.Queue()
         self.peers: queue.Queue[PeerSet] = queue.Queue()
         self.connection: queue.Queue[tuple[bool, str]] = queue.Queue()
@@ -77,12 +77,15 @@ class Robot:
     def welcome(self, welcome: Welcome) -> None:
         self.welcomes.put(welcome)
 
-    def apply_peers(self, peers: PeerSet) -> str | None:
-        self.peers.put(peers)
+    def apply_peers(self, peer_set: PeerSet) -> str | None:
+        self.peers.put(peer_set)
         return None
 
     def apply_mapping(self, mapping: MappingSet) -> str | None:
         return None
+
+    def applied(self, content: PeerSet | MappingSet) -> None:
+        """Nothing to remember."""
 
     def take_report(self, scope: ReportScope) -> Report:
         return Report()
