@@ -42,10 +42,11 @@ from plr.sidecar.core.seam.application import ExecuteRequest, OfferService, Requ
 from plr.sidecar.ros import rcl
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping
+    from collections.abc import Iterator
 
     from plr.protos.model.members import ServiceOffer
     from plr.sidecar.core.base.values import RejectReason, RequestId
+    from plr.sidecar.core.seam.application import CarriedService
     from plr.sidecar.ros.bridge import RosBridge
 
 CALLED_SERVICES = 4
@@ -196,8 +197,8 @@ class Shortcut:
         for offer in offers:
             self.robot.handle(OfferService(offer.name, offer.type))
 
-    def set_carried(self, services: Mapping[ServiceName, bool | None]) -> None:
-        self.carried = frozenset(services)
+    def set_carried(self, services: frozenset[CarriedService]) -> None:
+        self.carried = frozenset(service.name for service in services)
 
 
 def run_bridges(services: int) -> None:

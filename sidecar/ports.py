@@ -5,15 +5,13 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Protocol
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
-
     from plr.protos.model.ids import ServiceName, SessionId
     from plr.protos.model.mapping import MappingSet
     from plr.protos.model.members import PeerSet, ServiceOffer
     from plr.protos.model.report import Report
     from plr.sidecar.core.base.report_scope import ReportScope
     from plr.sidecar.core.base.values import ExecutionId, RejectReason, RequestId
-    from plr.sidecar.core.seam.application import ApplicationEvent
+    from plr.sidecar.core.seam.application import ApplicationEvent, CarriedService
 
 
 class DataPlane(Protocol):
@@ -44,11 +42,8 @@ class DataPlane(Protocol):
     def set_offers(self, offers: tuple[ServiceOffer, ...]) -> None:
         """Cloud: replace the set of services that local servers offer now."""
 
-    def set_carried(self, services: Mapping[ServiceName, bool | None]) -> None:
-        """Robot: replace the set of proxied services that exist in the local ROS graph now.
-
-        The value says whether the service's fallback can be called; None where it has none.
-        """
+    def set_carried(self, services: frozenset[CarriedService]) -> None:
+        """Robot: replace the set of proxied services that exist in the local ROS graph now."""
 
 
 class ControlledDataPlane(Protocol):

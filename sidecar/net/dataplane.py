@@ -37,6 +37,7 @@ if TYPE_CHECKING:
     from plr.sidecar.core.message.decoding import Decoding
     from plr.sidecar.core.path.history import Change
     from plr.sidecar.core.path.view import PathView
+    from plr.sidecar.core.seam.application import CarriedService
     from plr.sidecar.core.seam.links import LinkEvent
     from plr.sidecar.core.seam.stats import EngineStats, LinkStats
     from plr.sidecar.net.interface_thread import InterfaceThread
@@ -61,7 +62,7 @@ class DataPlaneHooks:
 
     application: Application
     services_changed: Callable[[], None]
-    """Offers or uses may have changed, which the control plane has to know."""
+    """`services` may have changed, which the control plane has to know; called with the engine's lock held."""
     reach_changed: Callable[[], None]
     """Interfaces or peers may have come: a mapping that was refused for lack of them may fit now."""
     paths_changed: Callable[[Mapping[InterfaceName, PathState]], None]
@@ -171,15 +172,13 @@ class ThreadedDataPlane:
 
     def set_offers(self, offers: tuple[ServiceOffer, ...]) -> None:
         """Cloud: replace the services that local servers offer right now."""
-        with self._lock:
-            self._engine.set_offers(offers)
-        self._hooks.services_changed()
+        with self._turn as (engine, _):
+            engine.set_offers(offers)
 
-    def set_carried(self, services: Mapping[ServiceName, bool | None]) -> None:
-        """Robot: replace the proxied services that exist right now, with whether their fallbacks can be asked."""
-        with self._lock:
-            self._engine.set_carried(services)
-        self._hooks.services_changed()
+    def set_carried(self, services: frozenset[CarriedService]) -> None:
+        """Robot: replace the proxied services that exist right now."""
+        with self._turn as (engine, _):
+            engine.set_carried(services)
 
     # -- the control client ---------------------------------------------------------------------------------------
 
@@ -330,6 +329,8 @@ class ThreadedDataPlane:
             self._hooks.application.handle(event)
         for peer, pem in self._engine.revocations.take_arrived():
             self._hooks.revocations(peer, pem)
+        if self._engine.take_services_changed():
+            self._hooks.services_changed()
         urgent = self._engine.take_urgency()
         if urgent is not None:
             self._hooks.report_urgent(urgent)

@@ -27,7 +27,13 @@ from plr.sidecar.core.engine.engine import EngineConfig
 from plr.sidecar.core.link.link import Link
 from plr.sidecar.core.link.sender import LinkIdentity
 from plr.sidecar.core.rules.service_rule import ServiceRule
-from plr.sidecar.core.seam.application import ApplicationEvent, OfferService, RequestFailed, ResponseArrived
+from plr.sidecar.core.seam.application import (
+    ApplicationEvent,
+    CarriedService,
+    OfferService,
+    RequestFailed,
+    ResponseArrived,
+)
 from plr.sidecar.core.seam.links import SetReady
 from plr.sidecar.net.dataplane import DataPlaneHooks, ThreadedDataPlane
 from plr.sidecar.net.interface_thread import InterfaceThread
@@ -142,7 +148,7 @@ class Robot:
         assert self.plane.apply_mapping(MappingSet(Version(1), 1, mappings)) is None
         with self._news:
             assert self._news.wait_for(lambda: self._offered == set(services), PATIENCE_S)
-        self.plane.set_carried(dict.fromkeys(services))
+        self.plane.set_carried(frozenset(map(CarriedService, services)))
 
     def __enter__(self) -> Self:
         return self

@@ -25,10 +25,11 @@ from plr.sidecar.core.seam.application import (
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
+    from collections.abc import Callable
 
     from plr.protos.model.members import ServiceOffer
     from plr.sidecar.core.base.values import RejectReason, RequestId
+    from plr.sidecar.core.seam.application import CarriedService
     from plr.sidecar.ports import Application
 
 log = logging.getLogger(__name__)
@@ -228,9 +229,8 @@ class RobotPlane:
     def set_offers(self, offers: tuple[ServiceOffer, ...]) -> None:
         raise AssertionError("a robot offers nothing")
 
-    def set_carried(self, services: Mapping[ServiceName, bool | None]) -> None:
-        self._link.carried = frozenset(services)
-        self._link.counts["carried_told"] += 1
+    def set_carried(self, services: frozenset[CarriedService]) -> None:
+        self._link.carried = frozenset(service.name for service in services)
 
 
 class CloudPlane:
@@ -258,5 +258,5 @@ class CloudPlane:
     def set_offers(self, offers: tuple[ServiceOffer, ...]) -> None:
         self._link.offered(offers)
 
-    def set_carried(self, services: Mapping[ServiceName, bool | None]) -> None:
+    def set_carried(self, services: frozenset[CarriedService]) -> None:
         raise AssertionError("a server carries nothing")

@@ -76,15 +76,3 @@ def test_a_network_that_answers_leaves_nothing_to_do_and_both_make_one_answer(
     assert counted(mesh)["started"] == 2
     wait_until(lambda: mesh.link.counts["completed"] == 6, "the network's answers")
     assert not mesh.robot.stats.dropped
-
-
-def test_what_a_fallback_brought_up_is_told_anew_when_the_first_server_comes(mesh: Mesh) -> None:
-    """The control plane hears of a service that is used once it is offered: nothing else changes here by then."""
-    start(mesh, takes_s=0.5)
-    mesh.serve("--plan", LOCAL, domain=mesh.robot_domain)
-    mesh.wait_carried(PLAN)
-    told = mesh.link.counts["carried_told"]
-    mesh.serve("--plan", PLAN, "--node", "in_the_cloud")
-    wait_until(lambda: mesh.link.offers, "the cloud's offer")
-    wait_until(lambda: mesh.link.counts["carried_told"] > told, "what is used being told")
-    assert mesh.link.carried == {PLAN}

@@ -21,7 +21,7 @@ from plr.sidecar.core.link.sender import LinkIdentity
 from plr.sidecar.core.path.key_exchange import DEFAULT_LIMITS
 from plr.sidecar.core.path.pmtu import HEADERS_V4
 from plr.sidecar.core.rules.service_rule import ServiceRule
-from plr.sidecar.core.seam.application import ApplicationEvent, ExecuteRequest, ResponseArrived
+from plr.sidecar.core.seam.application import ApplicationEvent, CarriedService, ExecuteRequest, ResponseArrived
 from plr.sidecar.core.seam.links import SetReady
 from tests.support.sessions import session_of
 
@@ -362,7 +362,7 @@ class Mesh:
 
             self.at(delay, answer)
         elif type(event).__name__ == "OfferService":
-            node.engine.set_carried(dict.fromkeys(node.engine._offers.offered))
+            node.engine.set_carried(frozenset(map(CarriedService, node.engine._offers.offered)))
 
     def _carry(self, source: Address, destination: Address, data: bytes) -> None:
         if self.tap is not None:

@@ -27,7 +27,13 @@ from plr.protos.trust.pair_token import pair_token
 from plr.sidecar.config.sidecar import SidecarConfig
 from plr.sidecar.core.base.values import RequestId
 from plr.sidecar.core.engine.engine import EngineConfig
-from plr.sidecar.core.seam.application import ExecuteRequest, OfferService, RequestFailed, ResponseArrived
+from plr.sidecar.core.seam.application import (
+    CarriedService,
+    ExecuteRequest,
+    OfferService,
+    RequestFailed,
+    ResponseArrived,
+)
 from plr.sidecar.net.dataplane import DataPlaneHooks, ThreadedDataPlane
 from plr.sidecar.net.interface_manager import InterfaceManager
 from plr.sidecar.state.start_session import start_session
@@ -103,7 +109,7 @@ class EngineProgram:
         """Robot: return when a path is up and the service can be called."""
         if not self._offered.wait(READY_TIMEOUT_S):
             raise TimeoutError("no path came up")
-        self._plane.set_carried({SERVICE: None})
+        self._plane.set_carried(frozenset({CarriedService(SERVICE)}))
 
     def call(self, **plan: Any) -> dict[str, Any]:
         """Robot: send the requests of a plan and return the log."""

@@ -28,7 +28,7 @@ from plr.sidecar.core.robot.request.mapping_table import MappingTable
 from plr.sidecar.core.robot.request.service_catalog import Offers
 from plr.sidecar.core.robot.request_table import RequestTable
 from plr.sidecar.core.rules.service_rule import Rules, ServiceRule
-from plr.sidecar.core.seam.application import ApplicationEvent, OfferService, WithdrawService
+from plr.sidecar.core.seam.application import ApplicationEvent, CarriedService, OfferService, WithdrawService
 from plr.sidecar.core.seam.links import (
     Attend,
     FinishedLost,
@@ -65,7 +65,7 @@ from plr.sidecar.core.wire.messages import (
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Iterable, Iterator, Mapping
+    from collections.abc import Collection, Iterable, Iterator
 
     from plr.protos.model.ids import InterfaceName, NodeName, ServiceName, SessionId
     from plr.protos.model.mapping import MappingSet, ServiceMapping
@@ -102,7 +102,9 @@ class Engine:
         self._interfaces: set[InterfaceName] = set()
         self._away: dict[NodeName, SessionId] = {}
         """Cloud: robots that fell silent, are no peers any more, and may come back with this session."""
-        self._carried: Mapping[ServiceName, bool | None] = {}
+        self._carried: frozenset[CarriedService] = frozenset()
+        self._services_changed = False
+        """Whether `offers` or `uses` may have changed since the last `take_services_changed`."""
         self._sweep_at = now + SWEEP_EVERY_S
         self._attention = Attention(now)
         self._inbound = Inbound(self._to_link, self.stats, answers=config.role is Role.CLOUD)
@@ -208,10 +210,12 @@ class Engine:
     def set_offers(self, offers: Iterable[ServiceOffer]) -> None:
         """Cloud: replace the services that local servers offer right now."""
         self._serving.set_offers(offers)
+        self._services_changed = True
 
-    def set_carried(self, services: Mapping[ServiceName, bool | None]) -> None:
-        """Robot: replace the proxied services that exist right now, with whether their fallbacks can be asked."""
+    def set_carried(self, services: frozenset[CarriedService]) -> None:
+        """Robot: replace the proxied services that exist right now."""
         self._carried = services
+        self._services_changed = True
 
     def drain(self) -> None:
         """Cloud: take no new requests; those in flight go on."""
@@ -233,6 +237,11 @@ class Engine:
     def uses(self) -> tuple[ServiceUse, ...]:
         """Return the services that this sidecar carries."""
         return self._offers.uses(self._carried)
+
+    def take_services_changed(self) -> bool:
+        """Return whether `offers` or `uses` may have changed since the last call."""
+        changed, self._services_changed = self._services_changed, False
+        return changed
 
     def set_interfaces(self, interfaces: Iterable[InterfaceName], now: float) -> None:
         """Replace the interfaces that have a link now."""
@@ -559,6 +568,7 @@ class Engine:
 
     def _tell(self, event: OfferService | WithdrawService, _now: float) -> None:
         self._events.append(event)
+        self._services_changed = True  # a service in use is carried and offered
 
     # -- time -----------------------------------------------------------------------------------------------------
 

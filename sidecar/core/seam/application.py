@@ -28,6 +28,15 @@ class WithdrawService:
 
 
 @dataclass(frozen=True, slots=True)
+class CarriedService:
+    """A service whose proxy exists in the robot's ROS graph now."""
+
+    name: ServiceName
+    fallback_up: bool | None = None
+    """Whether its fallback on the robot itself can be called; None: it has none."""
+
+
+@dataclass(frozen=True, slots=True)
 class ResponseArrived:
     """A response to a request. `judge_answer` says whether it can be delivered; until then another one may come."""
 

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from plr.sidecar.core.seam.application import (
+    CarriedService,
     DeadlineMissed,
     OfferService,
     RequestFailed,
@@ -30,7 +31,6 @@ from plr.sidecar.ros.robot.request_numbering import RequestNumbering
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from plr.protos.model.ids import ServiceName
     from plr.sidecar.core.base.values import RequestId
     from plr.sidecar.core.rules.service_rule import ServiceRule
     from plr.sidecar.core.seam.application import ApplicationEvent
@@ -99,7 +99,7 @@ class RobotSide:
             on_failure=self._tell_failure,
         )
         self._pending: dict[RequestId, _Pending] = {}
-        self._carried: dict[ServiceName, bool | None] = {}
+        self._carried: frozenset[CarriedService] = frozenset()
         """What the data plane was last told."""
         self._proxies = Proxies(
             loop=loop,
@@ -128,11 +128,11 @@ class RobotSide:
                 self._fail(event, now)
             case OfferService():
                 self._proxies.offer(event)
-                self._uses_changed()
+                self._publish_carried()
                 self.look_is_due = True
             case WithdrawService():
                 self._proxies.withdraw(event, self._fallbacks.types())
-                self._uses_changed()
+                self._publish_carried()
             case _:
                 self._stats.dropped["event_for_other_role"] += 1
 
@@ -324,13 +324,9 @@ class RobotSide:
         yield from self._proxies.look(served, self._fallbacks.types(), now)
         self._publish_carried()
 
-    def _uses_changed(self) -> None:
-        """Tell the data plane: a service in use is carried and offered, so any change of offers changes the uses."""
-        self._publish_carried()
-        self._data_plane.set_carried(self._carried)
-
     def _publish_carried(self) -> None:
-        carried = {service: self._stats.fallback_up.get(service) for service in self._stats.carried}
+        up = self._stats.fallback_up
+        carried = frozenset(CarriedService(service, up.get(service)) for service in self._stats.carried)
         if carried != self._carried:
             self._carried = carried
             self._data_plane.set_carried(carried)

@@ -16,11 +16,12 @@ from plr.sidecar.core.base.fair_share import Shares
 from plr.sidecar.core.seam.application import OfferService, WithdrawService
 
 if TYPE_CHECKING:
-    from collections.abc import Container, Mapping
+    from collections.abc import Container, Iterable
 
     from plr.protos.model.ids import NodeName, ServiceName
     from plr.protos.model.members import Peer
     from plr.sidecar.core.rules.service_rule import Rules
+    from plr.sidecar.core.seam.application import CarriedService
     from plr.sidecar.core.seam.stats import EngineStats
     from plr.sidecar.core.transfer.routes import Routes
 
@@ -152,15 +153,13 @@ class Offers:
         rule = self._rules.find(name)
         return max(WITHDRAW_AFTER_S, rule.lifetime_s) if rule else WITHDRAW_AFTER_S
 
-    def uses(self, carried: Mapping[ServiceName, bool | None]) -> tuple[ServiceUse, ...]:
-        """Return those of these services that are offered, as reported to the control plane.
-
-        `carried` says whether their fallbacks can be asked.
-        """
+    def uses(self, carried: Iterable[CarriedService]) -> tuple[ServiceUse, ...]:
+        """Return those of these services that are offered, as reported to the control plane."""
+        by_name = {service.name: service for service in carried}
         uses = []
         for name, kind in self._offered.items():
             rule = self._rules.find(name)
-            if rule is not None and name in carried:
+            if rule is not None and name in by_name:
                 uses.append(
                     ServiceUse(
                         name,
@@ -169,7 +168,7 @@ class Offers:
                         rule.idempotent,
                         rule.copies,
                         rule.target_miss,
-                        fallback_up=carried[name],
+                        fallback_up=by_name[name].fallback_up,
                         redundancy=rule.redundancy,
                         hedge_quantile=rule.hedge_quantile,
                         budgeted=self._budgeted,

@@ -26,7 +26,13 @@ from plr.sidecar.core.engine.engine import EngineConfig
 from plr.sidecar.core.link.link import Link
 from plr.sidecar.core.link.sender import Batch, LinkIdentity
 from plr.sidecar.core.rules.service_rule import ServiceRule
-from plr.sidecar.core.seam.application import ApplicationEvent, ExecuteRequest, OfferService, ResponseArrived
+from plr.sidecar.core.seam.application import (
+    ApplicationEvent,
+    CarriedService,
+    ExecuteRequest,
+    OfferService,
+    ResponseArrived,
+)
 from plr.sidecar.core.seam.links import SetReady
 from plr.sidecar.net.dataplane import DataPlaneHooks, ThreadedDataPlane
 from plr.sidecar.net.interface_thread import BLOCKED_TIMER_S, InterfaceThread
@@ -35,6 +41,7 @@ from tests.support.sessions import session_of
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
+    from plr.protos.model.members import ServiceUse
     from plr.protos.trust.credential import SessionCredential
     from plr.sidecar.core.link.pinging import Pong
 
@@ -56,9 +63,10 @@ class Node:
         self.news = threading.Condition()
         config = EngineConfig(role, (ServiceRule(SERVICE, 5.0, 20.0, idempotent=True),))
         self.pongs: queue.SimpleQueue[Pong] = queue.SimpleQueue()
+        self.uses_told: list[tuple[ServiceUse, ...]] = []
         hooks = DataPlaneHooks(
             self,
-            lambda: None,
+            lambda: self.uses_told.append(self.plane.services()[1]),
             self.count_reach,
             lambda _: None,
             lambda *_: None,
@@ -324,6 +332,24 @@ def test_forged_addresses_are_logged_once_and_so_is_their_end(
         assert tell(2) == []
     assert tell(3) == ["what the control plane tells of its addresses is used again"]
     assert tell(4) == []
+
+
+def test_a_service_that_is_carried_is_told_as_used_when_it_is_offered() -> None:
+    """Its fallback brought the proxy up: the bridge has nothing to say when the first server comes."""
+    robot, cloud = Node("robot", Role.ROBOT, 1), Node("cloud", Role.CLOUD, 2)
+    robot.plane.set_carried(frozenset({CarriedService(SERVICE, fallback_up=True)}))
+    assert robot.uses_told == [()]
+    with contextlib.ExitStack() as stack:
+        for node, other in ((robot, cloud), (cloud, robot)):
+            stack.callback(node.stop)
+            node.start(other)
+        robot.wait_for(OfferService)
+        end = time.monotonic() + PATIENCE_S
+        while not robot.uses_told[-1]:
+            assert time.monotonic() < end
+            time.sleep(0.001)
+        (use,) = robot.uses_told[-1]
+        assert (use.name, use.fallback_up) == (SERVICE, True)
 
 
 def test_tells_when_interfaces_or_peers_are_others(nodes: tuple[Node, Node], monkeypatch: pytest.MonkeyPatch) -> None:

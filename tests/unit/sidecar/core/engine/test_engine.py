@@ -12,15 +12,18 @@ from plr.sidecar.core.base.report_scope import ReportScope
 from plr.sidecar.core.base.values import PathId, PathState, Priority, RejectReason
 from plr.sidecar.core.engine.engine import SWEEP_EVERY_S, Engine, EngineConfig
 from plr.sidecar.core.message.reassembly import OVER_REMEMBERED
+from plr.sidecar.core.robot.request.service_catalog import WITHDRAW_AFTER_S
 from plr.sidecar.core.rules.budget import Budget
 from plr.sidecar.core.seam.application import (
     AbandonExecution,
     ApplicationEvent,
     CancelExecution,
+    CarriedService,
     ExecuteRequest,
     OfferService,
     RequestFailed,
     ResponseArrived,
+    WithdrawService,
 )
 from plr.sidecar.core.seam.links import (
     FinishedLost,
@@ -96,7 +99,7 @@ def cloud() -> Sidecar:
 
 def robot() -> Sidecar:
     sidecar = Sidecar(Role.ROBOT, A)
-    sidecar.engine.set_carried({ECHO: None})
+    sidecar.engine.set_carried(frozenset({CarriedService(ECHO)}))
     return sidecar
 
 
@@ -234,10 +237,30 @@ def test_the_robot_offers_what_a_reachable_cloud_offers_and_says_what_it_carries
     engine.on_link_event(PathChanged(path(), PathState.UP, ""), 0.1)
     assert engine.take_events() == [OfferService(ECHO, TYPE)]
     assert engine.uses() == ()
-    engine.set_carried({ECHO: None})
+    engine.set_carried(frozenset({CarriedService(ECHO)}))
     assert engine.uses() == (ServiceUse(ECHO, TYPE, 0.1, idempotent=True),)
-    engine.set_carried({ECHO: True})
+    engine.set_carried(frozenset({CarriedService(ECHO, fallback_up=True)}))
     assert engine.uses() == (ServiceUse(ECHO, TYPE, 0.1, idempotent=True, fallback_up=True),)
+
+
+def test_it_says_once_that_offers_or_uses_may_have_changed() -> None:
+    engine = Engine(EngineConfig(Role.ROBOT, (rule(ECHO),)), session_of("me", Role.ROBOT, 99), 0.0)
+    carried = frozenset({CarriedService(ECHO, fallback_up=True)})
+    engine.set_carried(carried)
+    assert [engine.take_services_changed() for _ in range(2)] == [True, False]
+    engine.set_interfaces([WLAN], 0.0)
+    engine.apply_peers(PeerSet(Version(1), 1, (peer(A),)), 0.0)
+    assert not engine.take_services_changed(), "no path leads to the server"
+    engine.on_link_event(PathChanged(path(), PathState.UP, ""), 0.1)
+    assert [engine.take_services_changed() for _ in range(2)] == [True, False], "its fallback brought it up before"
+    engine.on_link_event(PathChanged(path(), PathState.DOWN, ""), 0.2)
+    engine.handle_timer(0.1 + WITHDRAW_AFTER_S)
+    assert not engine.take_services_changed(), "it may come back"
+    engine.handle_timer(0.2 + WITHDRAW_AFTER_S)
+    assert engine.take_events()[-1:] == [WithdrawService(ECHO, "no path to a server for 15 s")]
+    assert [engine.take_services_changed() for _ in range(2)] == [True, False]
+    engine.set_offers(())
+    assert engine.take_services_changed()
 
 
 @pytest.mark.audit("ops-12")
@@ -248,7 +271,7 @@ def test_the_robot_says_how_its_copies_are_sent() -> None:
         engine.set_interfaces([WLAN], 0.0)
         engine.apply_peers(PeerSet(Version(1), 1, (peer(A),)), 0.0)
         engine.on_link_event(PathChanged(path(), PathState.UP, ""), 0.1)
-        engine.set_carried({ECHO: None})
+        engine.set_carried(frozenset({CarriedService(ECHO)}))
         (told,) = engine.uses()
         assert (told.redundancy, told.hedge_quantile, told.budgeted) == (RedundancyMode.HEDGE, 0.9, limited)
 
