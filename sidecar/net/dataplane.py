@@ -76,7 +76,10 @@ class DataPlaneHooks:
 
 
 class ThreadedDataPlane:
-    """Implements `plr.sidecar.ports.DataPlane` and `LinkOwner`; every method may be called from any thread."""
+    """Implements `DataPlane` and `ControlledDataPlane` (`plr.sidecar.ports`), `LinkOwner` and `DecodingOwner`.
+
+    Every method may be called from any thread.
+    """
 
     def __init__(self, config: EngineConfig, own: OwnSession, hooks: DataPlaneHooks) -> None:
         self._own = own
