@@ -2,141 +2,32 @@
 
 from __future__ import annotations
 
-import contextlib
-import itertools
-import logging
-import math
-import queue
 import random
 import socket
-import threading
 import time
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import pytest
 
-from plr.protos.base.errors import DecodeError
-from plr.protos.model.ids import InterfaceId, InterfaceName, NodeName, Role, ServiceName, SessionId, Version
-from plr.protos.model.members import ALL_CALLS, MAX_PEERS, Candidate, CandidateKind, Peer, PeerSet, ServiceOffer
-from plr.protos.trust.identity import NOT_YET_VALID, UNTRUSTED, CertificateError
-from plr.protos.trust.pair_token import pair_token
+from plr.protos.model.ids import InterfaceName, Role, Version
+from plr.protos.model.members import MAX_PEERS, PeerSet
 from plr.sidecar.core.base.values import PathState, RequestId
-from plr.sidecar.core.engine.engine import EngineConfig
-from plr.sidecar.core.link.link import Link
-from plr.sidecar.core.link.sender import Batch, LinkIdentity
-from plr.sidecar.core.rules.service_rule import ServiceRule
-from plr.sidecar.core.seam.application import (
-    ApplicationEvent,
-    CarriedService,
-    ExecuteRequest,
-    OfferService,
-    ResponseArrived,
-)
-from plr.sidecar.core.seam.links import SetReady
-from plr.sidecar.net.dataplane import DataPlaneHooks, ThreadedDataPlane
-from plr.sidecar.net.interface_thread import BLOCKED_TIMER_S, InterfaceThread
-from tests.support.sessions import session_of
+from plr.sidecar.core.link.sender import Batch
+from plr.sidecar.core.seam.application import CarriedService, OfferService, ResponseArrived
+from plr.sidecar.net.interface_thread import BLOCKED_TIMER_S
+from tests.support.joined_data_planes import PATIENCE_S, SERVICE, Node, joined, submit
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
-
-    from plr.protos.model.members import ServiceUse
-    from plr.protos.trust.credential import SessionCredential
-    from plr.sidecar.core.link.pinging import Pong
-
-SERVICE, TYPE = ServiceName("/echo"), "t/srv/Echo"
-PATIENCE_S = 20.0
-"""For a loaded machine; nothing here takes long."""
-
-
-class Node:
-    """A sidecar's data plane on one loopback socket; its application echoes and takes notes."""
-
-    def __init__(self, name: str, role: Role, session: int) -> None:
-        self.answers_at_once = False
-        self.name, self.role, self.session = NodeName(name), role, SessionId(session)
-        self.token = session.to_bytes(16, "big")
-        self.offers = (ServiceOffer(SERVICE, TYPE),) if role is Role.CLOUD else ()
-        self.events: list[ApplicationEvent] = []
-        self.reach_changes = 0
-        self.news = threading.Condition()
-        config = EngineConfig(role, (ServiceRule(SERVICE, 5.0, 20.0, idempotent=True),))
-        self.pongs: queue.SimpleQueue[Pong] = queue.SimpleQueue()
-        self.uses_told: list[tuple[ServiceUse, ...]] = []
-        hooks = DataPlaneHooks(
-            self,
-            lambda: self.uses_told.append(self.plane.services()[1]),
-            self.count_reach,
-            lambda _: None,
-            lambda *_: None,
-            pong=self.pongs.put,
-        )
-        own = self.own = session_of(name, role, session)
-        self.plane = ThreadedDataPlane(config, own, hooks)
-        sock = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-        sock.setblocking(False)
-        sock.bind(("127.0.0.1", 0))
-        now = time.monotonic()
-        identity = LinkIdentity.of(own.credential, self.token, InterfaceName("lo"), InterfaceId(0))
-        self.thread = InterfaceThread(sock, Link(identity, random.Random(session), now), None, self.plane)
-
-    def count_reach(self) -> None:
-        self.reach_changes += 1
-
-    def handle(self, event: ApplicationEvent) -> None:
-        if isinstance(event, ExecuteRequest):
-            arguments = (event.execution, b"echo:" + event.payload, 0.0)
-            if self.answers_at_once:
-                self.plane.complete(*arguments)
-            else:
-                threading.Thread(target=self.plane.complete, args=arguments).start()
-        if isinstance(event, ResponseArrived):
-            self.plane.judge_answer(event.request_id, event.copy, None)
-        with self.news:
-            self.events.append(event)
-            self.news.notify_all()
-
-    def told_to(self, other: Node) -> Peer:
-        candidate = Candidate(InterfaceId(0), InterfaceName("lo"), CandidateKind.HOST, ("127.0.0.1", self.thread.port))
-        token = pair_token(self.token, other.name, other.role)
-        peer = Peer(self.name, self.role, self.session, token, 1, (candidate,), self.offers, may_call=ALL_CALLS)
-        return replace(peer, credential=self.own.credential.encode())
-
-    def start(self, other: Node) -> None:
-        self.plane.start()
-        self.thread.start()
-        self.plane.set_links({InterfaceName("lo"): self.thread})
-        self.thread.post(SetReady(ready=True))
-        self.plane.set_offers(self.offers)
-        assert self.plane.apply_peers(PeerSet(Version(1), 1, (other.told_to(self),))) is None
-
-    def stop(self) -> None:
-        self.plane.stop()
-        self.thread.stop(PATIENCE_S)
-
-    def wait_for(self, kind: type[ApplicationEvent], count: int = 1) -> list[ApplicationEvent]:
-        def found() -> list[ApplicationEvent]:
-            return [event for event in self.events if isinstance(event, kind)]
-
-        with self.news:
-            assert self.news.wait_for(lambda: len(found()) >= count, PATIENCE_S), self.events
-        return found()
 
 
 @pytest.fixture
 def nodes() -> Iterator[tuple[Node, Node]]:
     robot, cloud = Node("robot", Role.ROBOT, 1), Node("cloud", Role.CLOUD, 2)
-    with contextlib.ExitStack() as stack:
-        for node, other in ((robot, cloud), (cloud, robot)):
-            stack.callback(node.stop)
-            node.start(other)
+    with joined(robot, cloud):
         robot.wait_for(OfferService)
         yield robot, cloud
-
-
-def submit(robot: Node, number: int, payload: bytes) -> None:
-    robot.plane.submit(RequestId(number.to_bytes(16, "big")), SERVICE, payload)
 
 
 @pytest.mark.parametrize("at_once", [False, True], ids=["by a thread of its own", "from within handle"])
@@ -246,103 +137,12 @@ def test_timers_do_not_spin_while_the_socket_takes_nothing() -> None:
     thread._socket.close()
 
 
-def test_a_peer_that_trust_no_longer_covers_loses_its_session_at_once(nodes: tuple[Node, Node]) -> None:
-    robot, cloud = nodes
-    submit(robot, 1, b"before")
-    robot.wait_for(ResponseArrived)
-
-    def judge(credential: SessionCredential) -> float:
-        raise DecodeError(f"{credential.name} is revoked")
-
-    robot.own._verify = judge
-    robot.plane.peer_trust.trust_changed()
-    assert robot.plane.engine_stats.dropped["bad_credential"] == 1
-    assert cloud.name not in robot.plane._engine.peers
-
-
-def test_a_peer_refused_while_the_clock_was_wrong_is_talked_to_when_it_is_right(
-    caplog: pytest.LogCaptureFixture,
-) -> None:
-    """Nobody sends the peers again: those on disk are the newest, and counted as taken."""
-    seconds = itertools.count(1000, -1)
-    wrong = True
-
-    def judge(credential: SessionCredential) -> float:
-        if wrong:
-            raise CertificateError(NOT_YET_VALID, f"not valid yet, for {next(seconds)} s")
-        return math.inf
-
-    robot, cloud = Node("robot", Role.ROBOT, 1), Node("cloud", Role.CLOUD, 2)
-    robot.own._verify = judge
-    with contextlib.ExitStack() as stack:
-        for node, other in ((robot, cloud), (cloud, robot)):
-            stack.callback(node.stop)
-            node.start(other)
-        for _ in range(3):
-            robot.plane.peer_trust.judge_again()
-            robot.plane.peer_trust.trust_changed()
-        assert caplog.text.count("is not talked to") == 1
-        assert cloud.name not in robot.plane._engine.peers
-        wrong = False
-        robot.plane.peer_trust.judge_again()
-        robot.wait_for(OfferService)
-        submit(robot, 1, b"at last")
-        robot.wait_for(ResponseArrived)
-
-
-def test_a_peer_of_a_ca_that_is_copied_late_is_talked_to_from_then_on(nodes: tuple[Node, Node]) -> None:
-    robot, cloud = nodes
-
-    def judge(credential: SessionCredential) -> float:
-        raise CertificateError(UNTRUSTED, "the certificate is of another CA")
-
-    believe, robot.own._verify = robot.own._verify, judge
-    robot.plane.peer_trust.trust_changed()
-    assert cloud.name not in robot.plane._engine.peers
-    robot.own._verify = believe
-    robot.plane.peer_trust.trust_changed()
-    assert cloud.name in robot.plane._engine.peers
-    submit(robot, 1, b"again")
-    robot.wait_for(ResponseArrived)
-
-
-@pytest.mark.audit("ops-3")
-def test_forged_addresses_are_logged_once_and_so_is_their_end(
-    nodes: tuple[Node, Node], monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
-    """Who reads the warning has to know whether it still holds."""
-    caplog.set_level(logging.INFO)
-    robot, cloud = nodes
-    versions = itertools.count(2)
-
-    def tell(serial: int) -> list[str]:
-        caplog.clear()
-        told = replace(cloud.told_to(robot), candidates_serial=serial)
-        assert robot.plane.apply_peers(PeerSet(Version(next(versions)), 1, (told,))) is None
-        return [line.split(": ", 1)[1] for line in caplog.messages if line.startswith("cloud: ")]
-
-    def refuse(_: Peer) -> bool:
-        raise DecodeError("the signature of its addresses is wrong")
-
-    with monkeypatch.context() as patch:
-        patch.setattr(robot.own, "check_candidates", refuse)
-        assert tell(1) == [
-            "what the control plane tells of its addresses is not used: the signature of its addresses is wrong"
-        ]
-        assert tell(2) == []
-    assert tell(3) == ["what the control plane tells of its addresses is used again"]
-    assert tell(4) == []
-
-
 def test_a_service_that_is_carried_is_told_as_used_when_it_is_offered() -> None:
     """Its fallback brought the proxy up: the bridge has nothing to say when the first server comes."""
     robot, cloud = Node("robot", Role.ROBOT, 1), Node("cloud", Role.CLOUD, 2)
     robot.plane.set_carried(frozenset({CarriedService(SERVICE, fallback_up=True)}))
     assert robot.uses_told == [()]
-    with contextlib.ExitStack() as stack:
-        for node, other in ((robot, cloud), (cloud, robot)):
-            stack.callback(node.stop)
-            node.start(other)
+    with joined(robot, cloud):
         robot.wait_for(OfferService)
         end = time.monotonic() + PATIENCE_S
         while not robot.uses_told[-1]:
