@@ -46,8 +46,8 @@ EXIT_FAILED = 1
 EXIT_USAGE = 2
 
 _NO_STUN_SERVERS = (
-    "stun_servers is empty: sidecars are told no STUN server, and robots behind a NAT stay unreachable unless their "
-    "own configuration names one"
+    "stun_servers is empty: sidecars get no STUN server, and robots behind a NAT stay unreachable unless their own "
+    "configuration names one"
 )
 
 log = logging.getLogger("plr.controlplane")
@@ -130,7 +130,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "--insecure-i-know",
         action="store_true",
-        help="allow insecure: true on an address that other machines reach: anybody there may read and change all",
+        help="allow insecure: true on an address that other machines can reach: anybody there can change everything",
     )
     parser.add_argument("--version", action=ShowVersion)
     return parser
@@ -181,7 +181,7 @@ async def _run(source: Path, config: ControlPlaneConfig, files: TlsFiles | None)
 
     if files is None:
         log.warning(
-            "insecure: true: no encryption towards sidecars and operators, and everybody who reaches %s is believed",
+            "insecure: true: traffic with sidecars and operators is in clear, and everybody who reaches %s is trusted",
             config.listen,
         )
 

@@ -300,7 +300,7 @@ class ControlLoop:
                     self._say(
                         logging.WARNING,
                         name,
-                        "%s refuses its %s, keeps version %d: %s",
+                        "%s refuses its %s and keeps version %d: %s",
                         name,
                         nack.resource.value,
                         nack.version,
@@ -311,7 +311,7 @@ class ControlLoop:
                     self._say(
                         logging.WARNING,
                         name,
-                        "%s offers %s, which the policy does not let it: told to no robot; missing under offers: %s",
+                        "%s offers %s, which the policy does not allow: no robot is told; missing under offers: %s",
                         name,
                         _few(services),
                         OfferRule((name,), services[:MAX_SERVICES_LOGGED]),
@@ -330,7 +330,7 @@ class ControlLoop:
                     self._say(
                         logging.INFO if lifted else logging.WARNING,
                         name,
-                        "%s: the policy leaves it %s to talk to",
+                        "%s: the policy lets it talk to %s",
                         name,
                         "somebody" if lifted else "nobody",
                     )
@@ -341,7 +341,7 @@ class ControlLoop:
         """Log a line that a member can cause at will, within its share of lines and that of all members."""
         left_out = self._lines.take(member, self._loop.time(), of_all)
         if left_out:
-            text, values = f"{text} (%d lines on it were left out before)", (*values, left_out)
+            text, values = f"{text} (%d earlier lines about it were left out)", (*values, left_out)
         if left_out is not None:
             log.log(level, text, *values)
 
@@ -474,7 +474,7 @@ class ControlLoop:
             settled = await self._loop.run_in_executor(self._executor, self._solve_and_settle, picture)
         except Exception:
             # The plan stays in force; one failed solving must not take the streams down.
-            log.exception("solving failed; the plan in force stays")
+            log.exception("solving failed; the current plan stays in force")
             self._core.solving_failed(self._loop.time())
             return
         self._metrics.solve_duration.observe(time.monotonic() - began)

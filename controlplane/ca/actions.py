@@ -52,7 +52,8 @@ def init(arguments: argparse.Namespace) -> str:
     authority = Authority.create(arguments.name, days=arguments.days)
     folder.create(authority)
     kept = "not encrypted" if passphrase is None else "encrypted"
-    return f"made the CA {arguments.name}, good until {listing.day(authority.not_after)}, its key {kept}: {folder.path}"
+    until = listing.day(authority.not_after)
+    return f"made the CA {arguments.name}, valid until {until}; its key is {kept}: {folder.path}"
 
 
 def issue(arguments: argparse.Namespace) -> str:
@@ -66,7 +67,7 @@ def issue(arguments: argparse.Namespace) -> str:
         save(folder, authority)
         write_tls_files(out, issued, authority.ca_pem, authority.crl_pem())
     until = listing.day(issued.certificate.not_valid_after_utc.timestamp())
-    return f"issued {arguments.name} ({role.value}), good until {until}: {out}"
+    return f"issued {arguments.name} ({role.value}), valid until {until}: {out}"
 
 
 def renew(arguments: argparse.Namespace) -> str:
@@ -81,7 +82,7 @@ def renew(arguments: argparse.Namespace) -> str:
         save(folder, authority)
         write_tls_files(out, issued, authority.ca_pem, authority.crl_pem())
     until = listing.day(issued.certificate.not_valid_after_utc.timestamp())
-    return f"renewed {arguments.name} ({last.role.value}), good until {until}: {out}"
+    return f"renewed {arguments.name} ({last.role.value}), valid until {until}: {out}"
 
 
 def revoke(arguments: argparse.Namespace) -> str:
@@ -90,8 +91,9 @@ def revoke(arguments: argparse.Namespace) -> str:
     with folder.locked() as authority:
         revoked = authority.revoke(arguments.name, x509.ReasonFlags(arguments.reason))
         save(folder, authority)
-    where = "copy to the control plane's tls_dir, or any node's"
-    return f"revoked {len(revoked)} of {arguments.name}; {where}: {folder.path / CRL_FILE}"
+    what = f"{len(revoked)} certificate{'s' * (len(revoked) != 1)} of {arguments.name}"
+    where = "copy it to the tls_dir of the control plane, or of any node"
+    return f"revoked {what}; {where}: {folder.path / CRL_FILE}"
 
 
 def publish(arguments: argparse.Namespace) -> str:
@@ -100,7 +102,7 @@ def publish(arguments: argparse.Namespace) -> str:
     with folder.locked() as authority:
         authority.publish()
         save(folder, authority)
-    return f"signed revocation list {authority.crl_number}; copy to any node's tls_dir: {folder.path / CRL_FILE}"
+    return f"signed revocation list {authority.crl_number}; copy it to any node's tls_dir: {folder.path / CRL_FILE}"
 
 
 def show(arguments: argparse.Namespace) -> str:
@@ -117,7 +119,7 @@ def rotate(arguments: argparse.Namespace) -> str:
         authority.rotate(arguments.name, days=arguments.days)
         save(folder, authority)
     files = f"{folder.path / CA_FILE} and {folder.path / CRL_FILE}"
-    return f"made the CA {arguments.name}; before renewing any node, copy to every tls_dir: {files}"
+    return f"made the CA {arguments.name}; before you renew any node, copy to every tls_dir: {files}"
 
 
 def retire(arguments: argparse.Namespace) -> str:
@@ -126,7 +128,7 @@ def retire(arguments: argparse.Namespace) -> str:
     with folder.locked() as authority:
         authority.retire()
         save(folder, authority)
-    return f"retired; copy to every tls_dir: {folder.path / CA_FILE} and {folder.path / CRL_FILE}"
+    return f"retired the former CAs; copy to every tls_dir: {folder.path / CA_FILE} and {folder.path / CRL_FILE}"
 
 
 def change_passphrase(arguments: argparse.Namespace) -> str:
@@ -135,7 +137,7 @@ def change_passphrase(arguments: argparse.Namespace) -> str:
     source = PassphraseSource("new passphrase", "--new-passphrase-file", NEW_VARIABLE, arguments.new_passphrase_file)
     new = None if arguments.no_passphrase else source.choose()
     folder.change_passphrase(new)
-    kept = "no longer encrypted" if new is None else "encrypted with the new passphrase; copies from before are not"
+    kept = "no longer encrypted" if new is None else "encrypted with the new passphrase; older copies of it are not"
     return f"the CA's key is {kept}: {folder.path}"
 
 
@@ -147,7 +149,7 @@ def opened(arguments: argparse.Namespace, *, warn: bool = True) -> AuthorityFold
     folder = AuthorityFolder(arguments.dir)
     protections = folder.protections()
     if warn and min(protections) is not Protection.GOOD:
-        how = "not encrypted" if min(protections) is Protection.CLEAR else "encrypted in an old way, cheap to guess at"
+        how = "not encrypted" if min(protections) is Protection.CLEAR else "encrypted by an old, weak method"
         _warn(f"{folder.path}: the CA's key is {how}; do: {_mend(arguments)}")
     if max(protections) is Protection.CLEAR:
         if arguments.passphrase_file is not None:
@@ -162,7 +164,7 @@ def _warn(problem: str) -> None:
 
 
 def _tell_of_wait() -> None:
-    sys.stderr.write("plr: another plr ca command is at work here; waiting for it\n")
+    sys.stderr.write("plr: another plr ca command is using this folder; waiting for it\n")
     sys.stderr.flush()
 
 

@@ -138,7 +138,7 @@ class Authority:
     def _refuse_key(self, name: str, key: str, what: str, instead: str) -> None:
         for entry in (*self._past, *self.all_entries()):
             if entry.key == key and entry.name != name:
-                raise AuthorityError(f"{what} is the one of {entry.name}; {instead}")
+                raise AuthorityError(f"{what} belongs to {entry.name}; {instead}")
             if entry.key == key and entry.revoked_at is not None:
                 raise AuthorityError(f"{what} was revoked; {instead}")
 
@@ -202,7 +202,7 @@ class Authority:
         """
         now = self._clock()
         if now >= self.not_after:
-            raise AuthorityError("the CA itself has ended; to go on, do: plr ca rotate (if this clock is right)")
+            raise AuthorityError("the CA's certificate has expired; if this clock is right, do: plr ca rotate")
         for authority in (self, *self.former):
             if now < authority.not_after:
                 authority.crl_number += 1
@@ -214,7 +214,7 @@ class Authority:
         No node may present a certificate of the new CA before the others have its `ca_pem`.
         """
         if len(self.former) + 1 >= MAX_CA_CERTIFICATES:
-            raise AuthorityError(f"nodes believe {MAX_CA_CERTIFICATES} CAs at most; do first: plr ca retire")
+            raise AuthorityError(f"nodes trust at most {MAX_CA_CERTIFICATES} CAs; do first: plr ca retire")
         before = Authority(self.own, self.entries, self.crl_number, clock=self._clock, published_at=self.published_at)
         self.own, self.entries, self.crl_number, self.published_at = _own(name, days, self._clock()), [], 0, None
         self.former.insert(0, before)
@@ -226,7 +226,7 @@ class Authority:
         waiting = sorted({entry.name for entry in self.all_entries() if entry.in_force(now)} - renewed)
         if waiting:
             raise AuthorityError(
-                "these nodes have a certificate of the former CA only; renew or revoke first: "
+                "these nodes have only a certificate of the former CA; renew or revoke them first: "
                 + ", ".join(waiting[:5])
                 + (f" and {len(waiting) - 5} more" if len(waiting) > 5 else "")
             )
@@ -246,8 +246,8 @@ class Authority:
             if entry.name == name:
                 return entry
         close = difflib.get_close_matches(name, {entry.name for entry in self.all_entries()}, n=1)
-        meant = f"did you mean {close[0]}?" if close else "plr ca list shows those that have one"
-        new = "a new node gets one by plr ca issue or plr ca sign"
+        meant = f"did you mean {close[0]}?" if close else "plr ca list shows the names that have one"
+        new = "a new node gets one from plr ca issue or plr ca sign"
         raise AuthorityError(f"{name} has no certificate of this CA; {meant}; {new}")
 
     def crl_pem(self) -> bytes:
@@ -286,7 +286,9 @@ class Authority:
         end = now + days * DAY_S
         if end > self.not_after:
             left = max(0, int((self.not_after - now) // DAY_S))
-            raise AuthorityError(f"the CA itself ends in {left} days; ask for fewer, or change the CA")
+            raise AuthorityError(
+                f"the CA's certificate expires in {left} days; give fewer --days, or make a new CA: plr ca rotate"
+            )
         return Validity(now - BACKDATE_S, end)
 
     def _issue(self, name: str, role: IdentityRole, validity: Validity, key: ec.EllipticCurvePrivateKey) -> Issued:

@@ -82,25 +82,25 @@ def add_ca(commands: Commands, summary: str) -> None:
             "sign",
             request_actions.sign,
             "certify a key that stays on its node",
-            "Show what a file of plr request asks for, and sign it once you confirm name and role: by both options, "
-            "or at the terminal. Of the request itself only its key is taken.",
+            "Show what a file of plr request asks for, and sign it once you confirm the name and the role, with both "
+            "options or at the terminal. Only the key is taken from the file itself.",
         ),
         (
             "renew",
             actions.renew,
             "make a further certificate for a node",
-            "The one before it stays good to its end.",
+            "The previous certificate stays valid until it expires.",
         ),
         ("revoke", actions.revoke, "refuse a node from now on", "Revoke all certificates of a name and write crl.pem."),
         (
             "publish",
             actions.publish,
             "sign the revocation list again",
-            "The same list with the time of now, for nodes that demand one that is not old (max_revocation_age_s).",
+            "Sign the same list with the current time, for nodes that demand a recent one (max_revocation_age_s).",
         ),
-        ("list", actions.show, "show what was issued", "Show every certificate and how long it is good."),
-        ("rotate", actions.rotate, "make a new CA beside the one in use", "Both are believed until: plr ca retire."),
-        ("retire", actions.retire, "stop believing former CAs", "Refused while a node depends on one of them."),
+        ("list", actions.show, "show what was issued", "Show every certificate and how long it is valid."),
+        ("rotate", actions.rotate, "make a new CA next to the one in use", "Nodes trust both until: plr ca retire."),
+        ("retire", actions.retire, "stop trusting former CAs", "It is refused while a node depends on one of them."),
         (
             "passphrase",
             actions.change_passphrase,
@@ -119,7 +119,7 @@ def add_request(commands: Commands, summary: str) -> None:
     parser = commands.add_parser(
         "request",
         help=summary,
-        description="Make a key and a request for its certificate, which plr ca sign answers. The key stays here.",
+        description="Make a key and a request for its certificate, for plr ca sign. The key stays on this machine.",
         epilog=_REQUEST_EXAMPLES,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
@@ -132,24 +132,24 @@ def add_request(commands: Commands, summary: str) -> None:
         default=Path("plr-request"),
         help="where to write it (default: ./plr-request)",
     )
-    parser.add_argument("--keep-key", action="store_true", help="ask for a certificate of the key that is there")
+    parser.add_argument("--keep-key", action="store_true", help="ask for a certificate of the existing key")
     parser.set_defaults(run=_reported(request_actions.request, lambda arguments: arguments.out))
 
 
 def _signing(parser: argparse.ArgumentParser) -> None:
-    help_text = f"what the CA's key is encrypted with (default: {VARIABLE} of the environment, else you are asked)"
+    help_text = f"passphrase of the CA's key (default: {VARIABLE} of the environment; without it, you are asked)"
     parser.add_argument("--passphrase-file", type=Path, metavar="FILE", help=help_text)
 
 
 def _authority_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--name", type=_common_name, default="fleet", help="what people call the CA (default: fleet)")
-    parser.add_argument("--days", type=_days, default=DEFAULT_CA_DAYS, help="how long it lasts (default: 3650)")
+    parser.add_argument("--name", type=_common_name, default="fleet", help="name of the CA (default: fleet)")
+    parser.add_argument("--days", type=_days, default=DEFAULT_CA_DAYS, help="days until it expires (default: 3650)")
 
 
 def _init_arguments(parser: argparse.ArgumentParser) -> None:
     _authority_arguments(parser)
     choice = parser.add_mutually_exclusive_group()
-    help_text = f"what to encrypt the CA's key with (default: {VARIABLE} of the environment, else you are asked)"
+    help_text = f"passphrase for the CA's key (default: {VARIABLE} of the environment; without it, you are asked)"
     choice.add_argument("--passphrase-file", type=Path, metavar="FILE", help=help_text)
     _no_passphrase(choice)
 
@@ -162,13 +162,13 @@ def _rotate_arguments(parser: argparse.ArgumentParser) -> None:
 def _passphrase_arguments(parser: argparse.ArgumentParser) -> None:
     _signing(parser)
     choice = parser.add_mutually_exclusive_group()
-    help_text = f"what to encrypt the key with from now on (default: {NEW_VARIABLE} of the environment, else asked)"
+    help_text = f"new passphrase for the key (default: {NEW_VARIABLE} of the environment; without it, you are asked)"
     choice.add_argument("--new-passphrase-file", type=Path, metavar="FILE", help=help_text)
     _no_passphrase(choice)
 
 
 def _no_passphrase(choice: argparse._MutuallyExclusiveGroup) -> None:
-    help_text = "leave the CA's key unencrypted: whoever reads the file can be any node"
+    help_text = "leave the CA's key unencrypted: whoever reads the file can pose as any node"
     choice.add_argument("--no-passphrase", action="store_true", help=help_text)
 
 
@@ -178,8 +178,8 @@ def _out_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _certificate_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--days", type=_days, default=DEFAULT_DAYS, help="how long it lasts (default: 90)")
-    parser.add_argument("--out", type=Path, metavar="DIR", help="where to write it (default: nodes/NAME in the CA's)")
+    parser.add_argument("--days", type=_days, default=DEFAULT_DAYS, help="days until it expires (default: 90)")
+    parser.add_argument("--out", type=Path, metavar="DIR", help="where to write it (default: nodes/NAME in --dir)")
     _signing(parser)
 
 
@@ -193,14 +193,16 @@ def _sign_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--name", type=checked(node_name), help="the name that it must ask for")
     parser.add_argument("--role", choices=_ROLES, help="the role that it must ask for")
     parser.add_argument(
-        "--fingerprint", metavar="SHA256:...", help="the key that it must be of, as plr request shows it"
+        "--fingerprint", metavar="SHA256:...", help="the fingerprint that its key must have, as plr request shows it"
     )
-    parser.add_argument("--renew", action="store_true", help="the name has a certificate, which stays good to its end")
+    parser.add_argument(
+        "--renew", action="store_true", help="the name already has a certificate, which stays valid until it expires"
+    )
     _certificate_arguments(parser)
 
 
 def _renew_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--keep-key", action="store_true", help="certify the key that is there, make no new one")
+    parser.add_argument("--keep-key", action="store_true", help="certify the existing key instead of making a new one")
     _out_arguments(parser)
 
 

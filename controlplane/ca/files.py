@@ -79,5 +79,7 @@ def refuse_planted(folder: Path) -> None:
     owner = folder.stat().st_uid
     if owner not in (0, os.geteuid()) and folder.absolute().parent.stat().st_mode & stat.S_IWOTH:
         raise OSError(
-            errno.EPERM, f"it belongs to user {owner}, where everybody may make folders: name another", str(folder)
+            errno.EPERM,
+            f"it belongs to user {owner}, in a folder where everybody may make some: name another",
+            str(folder),
         )

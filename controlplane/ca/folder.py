@@ -90,7 +90,7 @@ class AuthorityFolder:
     def refuse_existing(self) -> None:
         """Raise ConfigError if there is a CA already."""
         if (self.path / INDEX_FILE).exists():
-            raise ConfigError(str(self.path), "", "there is a CA already; another one needs another --dir")
+            raise ConfigError(str(self.path), "", "this folder already holds a CA; another one needs another --dir")
 
     def _refuse_other_things(self) -> None:
         """Refuse a folder that others use: only its owner will have access to it."""
@@ -217,7 +217,7 @@ class AuthorityFolder:
                     if read_regular(path, len(data) + 1) != data:
                         write_atomically(path, data, PUBLIC_FILE)
                 except OSError as error:
-                    problems.append(f"{path}: not brought up to date: {error.strerror or error}")
+                    problems.append(f"{path}: could not be updated: {error.strerror or error}")
         return problems
 
     def _keep_key(self, authority: Authority, folder: Path) -> None:

@@ -60,7 +60,7 @@ class PassphraseSource:
             return _checked(passphrase, self.variable if self.file is None else str(self.file))
         self._expect_terminal(", or --no-passphrase to leave the CA's key unencrypted")
         passphrase = _checked(_ask(f"{self.what} (at least {MIN_BYTES} characters): "), self.what)
-        if _ask("once more: ") != passphrase:
+        if _ask("again: ") != passphrase:
             raise ConfigError(self.what, "", "the two differ; nothing was changed")
         return passphrase
 

@@ -33,8 +33,8 @@ if TYPE_CHECKING:
 _MAY = {
     IdentityRole.ROBOT: "may call services",
     IdentityRole.CLOUD: "may offer services",
-    IdentityRole.CONTROL_PLANE: "may tell every sidecar where the others are",
-    IdentityRole.OPERATOR: "may ask the control plane about everybody",
+    IdentityRole.CONTROL_PLANE: "may tell every sidecar the addresses of the others",
+    IdentityRole.OPERATOR: "may ask the control plane about every node",
 }
 
 
@@ -61,18 +61,18 @@ def sign(arguments: argparse.Namespace) -> str:
     with folder.locked() as authority:
         out = arguments.out or folder.node_folder(asked.name)
         if (out / KEY_FILE).exists():
-            raise AuthorityError(f"{out}: holds a key, and not the request's; delete it or give another --out")
+            raise AuthorityError(f"{out}: holds a key that is not the request's; delete it or give another --out")
         refuse_taken(out, asked.name, own=arguments.out is None)
         certificate = authority.sign(asked, renewing=arguments.renew, days=arguments.days)
         save(folder, authority)
         write_certificate(out, certificate.public_bytes(Encoding.PEM), authority.ca_pem, authority.crl_pem())
     until = listing.day(certificate.not_valid_after_utc.timestamp())
-    return f"signed {asked.name} ({asked.role.value}), good until {until}; copy to where its key is: {out}"
+    return f"signed {asked.name} ({asked.role.value}), valid until {until}; copy to where its key is: {out}"
 
 
 def _new_key(out: Path) -> ec.EllipticCurvePrivateKey:
     if (out / KEY_FILE).exists():
-        raise AuthorityError(f"{out}: holds a key; give another --out, or --keep-key for a certificate of that one")
+        raise AuthorityError(f"{out}: already holds a key; give another --out, or --keep-key to certify it")
     make_private(out)
     key = generate_key()
     write_atomically(out / KEY_FILE, clear_pem(key), PRIVATE_FILE)
@@ -83,7 +83,7 @@ def _own_key(out: Path, name: str) -> ec.EllipticCurvePrivateKey:
     key = kept_key(out)
     if not isinstance(key.curve, ec.SECP256R1):
         raise AuthorityError(
-            f"{out / KEY_FILE}: not on P-256; make another without --keep-key: plr request {name} --role ..."
+            f"{out / KEY_FILE}: is not on P-256; make another one without --keep-key: plr request {name} --role ..."
         )
     return key
 

@@ -46,7 +46,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         parser = _parser(argv[0] if argv else "")
     arguments = parser.parse_args(argv)
     if arguments.run is None:
-        parser.error(f"expected COMMAND before all else, got {argv[0]!r}")
+        parser.error(f"expected COMMAND first, got {argv[0]!r}")
     code: int = arguments.run(arguments)
     return code
 
@@ -121,14 +121,14 @@ def _policy(commands: Commands, summary: str) -> None:
 
 
 _COMMANDS: dict[str, tuple[str, Callable[[Commands, str], None]]] = {
-    "status": ("who is connected, how far each follows, and who is gone", _status),
+    "status": ("which sidecars are connected, what each has applied, and which are gone", _status),
     "explain": ("why a robot's requests for a service go where they go", _explain),
     "events": ("what happened in the fleet: who came, who went and why", _events),
     "plan": ("how many interfaces and servers meet a target, from recordings", _plan),
     "ca": ("issue and revoke the fleet's certificates", _ca),
     "request": ("make a key on its node, and a request to certify it", _request),
-    "config": ("about configuration files", _config),
-    "policy": ("about the access policy in a control plane's configuration", _policy),
+    "config": ("show the JSON Schema of the configuration files", _config),
+    "policy": ("check the access policy in a control plane's configuration", _policy),
 }
 """Purpose of each command, and the function that adds its options, by name."""
 
@@ -136,7 +136,7 @@ _COMMANDS: dict[str, tuple[str, Callable[[Commands, str], None]]] = {
 _ON_A_NODE = {
     "doctor": "on a robot or a server: what is wrong with this node, and what to do",
     "ping": "on a robot or a server: how long each path to a peer takes",
-    "bugreport": "on a robot or a server: a tar file for whoever helps",
+    "bugreport": "on a robot or a server: make a tar file for whoever helps",
 }
 """The sidecar's commands, which `plr.protos.program.command_line` takes: listed, and suggested after a typo."""
 

@@ -63,7 +63,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     security.add_argument(
         "--tls-dir", type=Path, metavar="DIR", help="folder with an operator's certificate, as plr ca issue writes it"
     )
-    security.add_argument("--insecure", action="store_true", help="without TLS, for a control plane that has none")
+    security.add_argument("--insecure", action="store_true", help="connect without TLS, if the control plane has none")
     parser.add_argument("--timeout-s", type=number(MIN_TIMEOUT_S, MAX_TIMEOUT_S), default=5.0, metavar="SECONDS")
     parser.add_argument("--json", action="store_true", help="print the answer as JSON")
 
@@ -102,13 +102,13 @@ def ask(arguments: argparse.Namespace, call: Callable[[admin_pb2_grpc.AdminStub,
     except ConfigError as error:
         raise AskError(str(error), EXIT_USAGE) from error
     except DecodeError as error:
-        raise AskError(f"{address}: answers what it must not: {error}", EXIT_FAILED) from error
+        raise AskError(f"{address}: the answer is malformed: {error}", EXIT_FAILED) from error
 
 
 def _late(timeout_s: float) -> str:
     return (
-        f"no answer within {timeout_s:g} s: see whether the control plane's host is up and a firewall lets TCP "
-        "through, or give it more time: --timeout-s"
+        f"no answer within {timeout_s:g} s: check that the control plane's host is up and that firewalls let TCP "
+        "through, or allow more time with --timeout-s"
     )
 
 
@@ -116,8 +116,8 @@ def _advice(detail: str, files: TlsFiles | None) -> str | None:
     """Return what gRPC's text for a failed connection means, and what to do; None if there is nothing to add."""
     if "Connection refused" in detail:
         return (
-            "nobody listens there (TCP): see whether the control plane runs, and give the address of its "
-            "listen (port 50051 unless configured), not that of STUN"
+            "nothing listens on this TCP port: check that the control plane runs, and give the address in its listen "
+            "key (port 50051 by default), not that of STUN"
         )
     return tls_advice.explain(detail, files, time.time())
 

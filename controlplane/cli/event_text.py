@@ -18,11 +18,11 @@ SHOWN = 20
 
 WORDS = {
     Why.LEASE_EXPIRED: "silent for longer than its lease",
-    Why.CERTIFICATE_EXPIRED: "its certificate has ended",
+    Why.CERTIFICATE_EXPIRED: "its certificate has expired",
     Why.REVOKED: "its certificate is revoked",
     Why.DRAINED: "it was stopped",
-    Why.LEFT: "it was being stopped, and fell silent",
-    Why.POLICY: "the policy leaves it nobody to talk to",
+    Why.LEFT: "it was being stopped and fell silent",
+    Why.POLICY: "the policy lets it talk to nobody",
 }
 
 
@@ -40,7 +40,7 @@ def departed(gone: Sequence[DepartedSidecar], left_out: int) -> Iterator[str]:
     """Yield the sidecars that are gone, the last to go first."""
     if not gone:
         return
-    yield "gone, the last first:"
+    yield "gone sidecars, newest first:"
     rows = [("NAME", "ROLE", "GONE FOR", "LAST SEEN", "WHY", "SERVICES", "SOFTWARE")]
     rows += [
         (
@@ -66,9 +66,9 @@ def events(last: Sequence[FleetEvent], state: EventLogState) -> Iterator[str]:
         yield "last events (plr events shows more):"
         yield from (f"  {line(event)}" for event in last)
     if state.problem:
-        yield f"EVENTS ARE NOT ON THE DISK: {state.problem}"
+        yield f"EVENTS ARE NOT WRITTEN TO DISK: {state.problem}"
     if state.damaged:
-        yield f"{state.damaged} damaged lines of the log of events were skipped"
+        yield f"{state.damaged} damaged lines of the event log were skipped"
 
 
 def age(seconds: float) -> str:

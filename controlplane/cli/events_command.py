@@ -52,21 +52,21 @@ def add_to(commands: Commands, summary: str) -> None:
         epilog=_EPILOG,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    events.add_argument("--node", type=checked(node_name), metavar="NAME", help="of this sidecar alone")
+    events.add_argument("--node", type=checked(node_name), metavar="NAME", help="show only events of this sidecar")
     events.add_argument(
         "--since",
         type=_since,
         default=0.0,
         metavar="WHEN",
-        help="90s, 30m, 2h, 7d ago, or a time (UTC if none is said)",
+        help="show events from 90s, 30m, 2h or 7d ago on, or from a time on (UTC unless it has a zone)",
     )
     events.add_argument(
         "--last",
         type=whole(0, 1 << 31),
         metavar="N",
-        help=f"so many at most, the newest; 0: all (default {LAST}; with --since all)",
+        help=f"show at most this many, the newest; 0: all (default {LAST}; with --since all)",
     )
-    events.add_argument("--follow", action="store_true", help="go on with what happens from now on, until Ctrl-C")
+    events.add_argument("--follow", action="store_true", help="keep showing new events until Ctrl-C")
     add_options(events)
     events.set_defaults(run=_events)
 
@@ -79,7 +79,7 @@ def _since(text: str) -> float:
         at = datetime.fromisoformat(text)
         return max(0.0, (at if at.tzinfo is not None else at.replace(tzinfo=UTC)).timestamp())
     except (ValueError, OverflowError):
-        raise argparse.ArgumentTypeError(f"expected such as 30m, 2h, 7d or 2026-03-01T08:00, got {text!r}") from None
+        raise argparse.ArgumentTypeError(f"expected 30m, 2h, 7d, 2026-03-01T08:00 or the like, got {text!r}") from None
 
 
 def _events(arguments: argparse.Namespace) -> int:

@@ -21,9 +21,9 @@ if TYPE_CHECKING:
 EXIT_OK = 0
 
 _EPILOG = """\
-shows: the mapping in force and its reason; for each pair of an interface and a server what is believed of its
-probability to miss the deadline (epsilon), and by which evidence; which interfaces fail together; what other
-mappings would give; the last changes. How each is computed: docs/develop/theory.md.
+shows: the mapping in force and its reason; for each pair of an interface and a server, the estimated probability that
+it misses the deadline (epsilon) and the evidence for that; which interfaces fail together; what other mappings would
+give; the last changes. How each is computed: docs/develop/theory.md.
 
 examples:
   plr explain --tls-dir ~/.plr/alice robot-7 /plan

@@ -36,21 +36,21 @@ def render(explanation: Explanation) -> str:
     if found.gone_s is not None:
         why = found.gone_why.value if found.gone_why is not None else "unknown"
         lines += [
-            f"{found.robot} IS GONE for {_age(found.gone_s)} ({why}): this is the last that was known, as of then",
+            f"{found.robot} IS GONE for {_age(found.gone_s)} ({why}): this shows what was known then",
             "",
         ]
     lines += [f"{found.robot} {found.service}: deadline {_ms(found.deadline_s)}, {kind}, {aim}"]
     for title, section in (
         ("mapping in force", list(_mapping(found))),
         ("pairs (times in ms, * in force)", list(_pairs(found))),
-        ("servers whose answers can not be delivered: others go before them", list(columns(_penalties(found)))),
-        ("who says what the servers need", list(columns(_witnesses(found)))),
+        ("servers whose answers cannot be delivered: other servers come first", list(columns(_penalties(found)))),
+        ("robots that measured the servers' computing times", list(columns(_witnesses(found)))),
         (
             "interfaces that carried copies of the same requests",
             list(columns([_joint(joint) for joint in found.joints])),
         ),
         ("what other mappings would give", list(columns([_alternative(other) for other in found.alternatives]))),
-        ("changes, the last first", list(columns([_change(change) for change in found.changes]))),
+        ("changes, newest first", list(columns([_change(change) for change in found.changes]))),
     ):
         if section:
             lines += ["", f"{title}:", *(f"  {line}" for line in section)]
@@ -59,14 +59,14 @@ def render(explanation: Explanation) -> str:
 
 def _mapping(found: Explanation) -> Iterator[str]:
     if found.mapping is None:
-        yield "none was sent yet"
+        yield "none has been sent yet"
         return
     yield _paths(found.mapping.assignments)
-    observed = f", observed lately {_probability(found.observed_miss)}" if found.observed_miss is not None else ""
+    observed = f", recently observed {_probability(found.observed_miss)}" if found.observed_miss is not None else ""
     cost = f", a request costs {found.cost_per_request:g}" if found.cost_per_request is not None else ""
     predicted = found.mapping.predicted_miss if found.predicted_miss is None else found.predicted_miss
     yield f"predicted miss {_probability(predicted)}{observed}{cost}"
-    age = f", goes there for {_age(found.in_force_s)}" if found.in_force_s is not None else ""
+    age = f", in use for {_age(found.in_force_s)}" if found.in_force_s is not None else ""
     refused = f" ({found.sync.error})" if found.sync.error else ""
     yield f"version {found.sync.version_sent}, {found.sync.state.value}{refused}{age}"
     yield f"reason: {found.mapping.reason or '-'}"
@@ -107,7 +107,7 @@ def _penalties(found: Explanation) -> list[tuple[str, ...]]:
     return [
         (
             f"{server}:",
-            f"{pair.bad_answers} bad answer{'s' * (pair.bad_answers != 1)} to {found.robot} lately,",
+            f"{pair.bad_answers} bad answer{'s' * (pair.bad_answers != 1)} to {found.robot} recently,",
             f"penalty ends in {_age(pair.penalty_s)}",
         )
         for server, pair in of_servers.items()

@@ -36,7 +36,7 @@ MAX_REQUESTS = 5_000_000
 MAX_MESSAGE_BYTES = 1 << 24
 
 _EPILOG = """\
-The LSC theorem says that one server behind one path can not be latency-reliable on commodity infrastructure: it misses
+The LSC theorem says that one server behind one path cannot be latency-reliable on commodity infrastructure: it misses
 with some epsilon > 0. Copies over k independent paths all miss with epsilon^k, so some k meets any target. This command
 says which: PRODUCT is what independent paths would give, JOINT what was recorded. Each interface goes to one server.
 
@@ -71,10 +71,14 @@ def add_to(commands: Commands, summary: str) -> None:
         help="traces of two paths, .csv or .csv.gz, or folders",
     )
     plan.add_argument("--deadline-ms", type=_number(0.0), metavar="MS", help="with --recorded: the service's own")
-    plan.add_argument("--target", type=_number(0.0, 1.0), metavar="PROBABILITY", help="to miss at most so often")
-    plan.add_argument("--plot", type=Path, metavar="FILE", help="draw it over the deadline: .svg or .html")
+    plan.add_argument(
+        "--target", type=_number(0.0, 1.0), metavar="PROBABILITY", help="highest acceptable probability to miss"
+    )
+    plan.add_argument(
+        "--plot", type=Path, metavar="FILE", help="plot the probability over the deadline into this .svg or .html file"
+    )
     plan.add_argument("--json", action="store_true", help="print the table as JSON")
-    workload = plan.add_argument_group("what is sent through traces")
+    workload = plan.add_argument_group("requests that are sent through traces")
     size = whole(1, MAX_MESSAGE_BYTES)
     workload.add_argument("--request-bytes", type=size, metavar="N", help=f"the default is {DEFAULT.request_bytes}")
     workload.add_argument("--answer-bytes", type=size, metavar="N", help=f"the default is {DEFAULT.answer_bytes}")
@@ -159,7 +163,7 @@ def _recorded(arguments: argparse.Namespace) -> tuple[Source, float]:
     from plr.controlplane.planning.recorded import RecordedService, read_recording
 
     if _given(arguments):
-        raise _UsageError("sizes, rate and computing times go with --traces: what was recorded is as it was")
+        raise _UsageError("sizes, rate and computing times need --traces: a recording has its own")
     source = RecordedService(read_recording(arguments.recorded))
     deadline_ms = arguments.deadline_ms
     return source, source.deadline_s if deadline_ms is None else deadline_ms / 1e3

@@ -42,8 +42,8 @@ DETAILED_AT_MOST = 64
 """Most sidecars in order that are still shown with their mapping and paths: a few screens full."""
 
 _EPILOG = """\
-shows: one row a sidecar; then mapping and paths of each, of a fleet of more than 64 only where something is wrong;
-who is gone; the last events. Those named are shown in full, and with --all all are.
+shows: a row for each sidecar; the mapping and paths of each, but in a fleet of more than 64 only of those with a
+problem; the sidecars that are gone; the last events. Named sidecars are shown in full, and with --all all of them.
 
 examples:
   plr status --tls-dir ~/.plr/alice --address control.example.org:50051
@@ -57,8 +57,8 @@ def add_to(commands: Commands, summary: str) -> None:
     status = commands.add_parser(
         "status", help=summary, epilog=_EPILOG, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    status.add_argument("names", nargs="*", type=checked(node_name), metavar="NAME", help="these sidecars alone")
-    status.add_argument("--all", action="store_true", help="mapping and paths of all, however many they are")
+    status.add_argument("names", nargs="*", type=checked(node_name), metavar="NAME", help="show only these sidecars")
+    status.add_argument("--all", action="store_true", help="show mapping and paths of all, also in a large fleet")
     add_options(status)
     status.set_defaults(run=_status)
 
@@ -102,7 +102,9 @@ def _status(arguments: argparse.Namespace) -> int:
     sys.stdout.write(f"{shown}\n" if shown else "")
     missing = set(query.names) - {status.peer.name for status in answer.sidecars}
     for name in sorted(missing):
-        sys.stderr.write(f"plr: {name} is not registered; plr status shows who is, plr events --node {name} who was\n")
+        sys.stderr.write(
+            f"plr: {name} is not registered; plr status shows which are, plr events --node {name} shows its past\n"
+        )
     return EXIT_FAILED if missing else EXIT_OK
 
 

@@ -63,7 +63,8 @@ def render(sidecars: Sequence[SidecarStatus], own: RevocationSet = NO_REVOCATION
             lines.append(f"  and {len(details) - MAX_LINES} more: plr status {status.peer.name} --json")
     abridged = sum(status.abridged for status in sidecars)
     if abridged:
-        lines += ["", f"mapping and paths of {abridged} that are in order are not shown: plr status NAME, or --all"]
+        what = f"mapping and paths of {abridged} sidecars without problems"
+        lines += ["", f"{what} are not shown; plr status NAME, or --all, shows them"]
     return "\n".join(lines)
 
 
@@ -90,7 +91,7 @@ def _details(status: SidecarStatus) -> Iterator[tuple[str, bool]]:
         if resource.state is SyncState.REJECTED:
             yield f"{name} {_rejection(resource)}", True
     if status.refused_offers:
-        yield f"REFUSED by the policy: {', '.join(status.refused_offers)} (offered here, told to no robot)", True
+        yield f"REFUSED by the policy: {', '.join(status.refused_offers)} (offered here, announced to no robot)", True
     for mapping in status.services:
         yield _mapping(mapping), not mapping.assignments
     for use in status.uses:
@@ -100,14 +101,14 @@ def _details(status: SidecarStatus) -> Iterator[tuple[str, bool]]:
     lines = columns([_path(path) for path in status.paths])
     yield from ((line, not path.up) for line, path in zip(lines, status.paths, strict=True))
     for interface in status.down:
-        yield f"{interface} DOWN: it would be used, and is not there, or has no link or no address", True
+        yield f"{interface} DOWN: the sidecar would use it, but it is missing or has no link or no address", True
 
 
 def _unserved(status: SidecarStatus) -> Iterator[str]:
     for name in status.withdrawn:
-        yield f"LOST {name}: a node there offered it, and none does now"
+        yield f"LOST {name}: a node there offered it, but none does now"
     for name, requests in status.unanswered.items():
-        yield f"UNANSWERED {name}: had the last {requests} requests that robots measured, and answered none of them"
+        yield f"UNANSWERED {name}: received the last {requests} requests that robots measured, but answered none"
 
 
 class _Hints:
@@ -134,17 +135,17 @@ def _unmet(status: SidecarStatus, hints: _Hints) -> Iterator[str]:
     own = {offer.name for offer in status.peer.offers}
     for name in status.unmet:
         hint = hints.of(name, own)  # a cloud does not mean what it offers itself
-        whose = "no server that it knows of" if status.peer.role is Role.ROBOT else "no node there"
+        whose = "no server that it knows" if status.peer.role is Role.ROBOT else "no node there"
         why = "" if status.peer.role is Role.ROBOT else ", or none that can be called; plr doctor there says which"
-        yield f"UNMET {name}: configured, and {whose} offers it{hint or why}"
+        yield f"UNMET {name}: configured, but {whose} offers it{hint or why}"
     for name in status.unreached:
-        yield f"UNREACHED {name}: servers that it knows of offer it, and it reaches none of them"
+        yield f"UNREACHED {name}: servers that it knows offer it, but it reaches none of them"
 
 
 def _untyped(status: SidecarStatus) -> Iterator[str]:
     what = "carried" if status.peer.role is Role.ROBOT else "offered"
     for name in status.untyped:
-        yield f"UNTYPED {name}: not {what}, as its service type is not installed there; plr doctor there names it"
+        yield f"UNTYPED {name}: not {what}: its service type is not installed there; plr doctor there names it"
 
 
 def _revocations(held: RevocationSet, of_own: Mapping[int, int], now_wall: float) -> Iterator[str]:
@@ -154,12 +155,12 @@ def _revocations(held: RevocationSet, of_own: Mapping[int, int], now_wall: float
         age = f"{age_s / _DAY_S:.1f} days ago" if age_s >= 0.0 else f"{-age_s:.0f} s FROM NOW: a clock is wrong"
         own = of_own.get(one.ca)
         if own is None or one.number > own:
-            yield f"claims revocation list {one.number}, which the control plane has not, signed {age}"
+            yield f"claims revocation list {one.number}, which the control plane does not have, signed {age}"
             continue
         older = f": OLDER than the control plane's {own}" if one.number < own else ""
         yield f"revocation list {one.number}, signed {age}{older}"
     if held.too_old:
-        yield f"REVOCATION LIST TOO OLD of {held.too_old} CAs: talks to none of their nodes; do: plr ca publish"
+        yield f"REVOCATION LIST TOO OLD of {held.too_old} CAs: it talks to none of their nodes; do: plr ca publish"
 
 
 def _rejection(resource: ResourceStatus) -> str:

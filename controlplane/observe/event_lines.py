@@ -45,19 +45,19 @@ def decode(line: bytes) -> FleetEvent:
     try:
         shown = json.loads(line)
     except (ValueError, RecursionError) as error:
-        raise DecodeError("no JSON") from error
+        raise DecodeError("expected JSON") from error
     if not isinstance(shown, dict):
-        raise DecodeError("no JSON object")
+        raise DecodeError("expected a JSON object")
     number = shown.get("number")
     if type(number) is not int or not 0 < number < MAX_NUMBER:
-        raise DecodeError("no number")
+        raise DecodeError("expected a number")
     kind = _member(EventKind, shown, "kind")
     if kind is None:
-        raise DecodeError("no kind")
+        raise DecodeError("expected a kind")
     node = shown.get("node")
     text = shown.get("text", "")
     if not isinstance(text, str) or clean_text(text) != text:
-        raise DecodeError("no text")
+        raise DecodeError("expected printable text")
     return FleetEvent(
         number=number,
         at=_seconds(shown.get("at")),
@@ -77,14 +77,14 @@ def timestamp(at: float) -> str:
 
 def _seconds(text: object) -> float:
     if not isinstance(text, str):
-        raise DecodeError("no time")
+        raise DecodeError("expected a time")
     try:
         at = datetime.fromisoformat(text)
         if at.tzinfo is None:
-            raise DecodeError("a time without its zone")
+            raise DecodeError("expected a time with its zone")
         return at.timestamp()
     except (ValueError, OverflowError) as error:
-        raise DecodeError("no time") from error
+        raise DecodeError("expected a time") from error
 
 
 def _member(kind: type[E], shown: dict[str, Any], field: str) -> E | None:

@@ -96,11 +96,11 @@ class EventLog:
     def announce(self) -> None:
         """Log what is wrong with the log; not at once, since a program that fails to start has other things to say."""
         if self._path is None:
-            log.info("events are kept in memory only, and a restart forgets who is gone: state_dir is not set")
+            log.info("state_dir is not set: events are kept in memory only, and a restart forgets who is gone")
         elif self._problem:
             log.error("events are kept in memory only: %s", self._problem)
         if self._damaged:
-            log.warning("%s: %d damaged lines of the log of events skipped", self._path, self._damaged)
+            log.warning("%s: skipped %d damaged lines of the event log", self._path, self._damaged)
 
     # ── for the loop ──
 
@@ -120,7 +120,7 @@ class EventLog:
                 self._suppressed[node] = self._suppressed.get(node, 0) + 1
             return
         if node is not None and (more := self._suppressed.pop(node, 0)):
-            text = f"{text} (and {more} events before it that were too many to keep)"
+            text = f"{text} (and {more} earlier events that were too many to keep)"
         at = self._wall()
         # Numbers grow even after the log was lost: a client that asks for new events must not wait for a catch-up.
         number = max(self._memory.last_number + 1, int(at * 1e6))
@@ -209,7 +209,7 @@ class EventLog:
         except FileNotFoundError:
             pass
         except OSError as error:
-            log.error("%s cannot be read: %s; events begin anew", path / FILE, error.strerror or error)
+            log.error("%s cannot be read: %s; the event log starts empty", path / FILE, error.strerror or error)
         self._write_all |= self._damaged > 0
         last = self._memory.last(1)
         if last:
@@ -273,7 +273,7 @@ class EventLog:
                     self._write_all = True
             else:
                 if failed_at is not None:
-                    log.info("events are on the disk again")
+                    log.info("events are written to the disk again")
                 failed_at, self._problem = None, ""
             if closing:
                 self._close_file()
@@ -283,7 +283,7 @@ class EventLog:
         self._write_failures += 1
         self._problem = f"{FILE}: {error.strerror or error}"
         if not told:
-            log.error("%s not written: %s; tried again, and remembered meanwhile", FILE, error.strerror or error)
+            log.error("%s cannot be written: %s; events stay in memory until it can", FILE, error.strerror or error)
         self._close_file()
         return self._clock()
 

@@ -208,8 +208,9 @@ def _members(fleet: Fleet) -> Iterator[Metric]:
 
     labels = ("sidecar", "role")
     yield _gauge("plr_sidecar_up", "1 while the sidecar's control stream is open.", labels, up)
-    yield _gauge("plr_sidecar_last_seen_timestamp_seconds", "When the sidecar was heard of last.", labels, seen)
-    yield _gauge("plr_sidecar_certificate_expiry_timestamp_seconds", "When its certificate ends.", labels, ends)
+    text = "When the control plane last heard from the sidecar."
+    yield _gauge("plr_sidecar_last_seen_timestamp_seconds", text, labels, seen)
+    yield _gauge("plr_sidecar_certificate_expiry_timestamp_seconds", "When its certificate expires.", labels, ends)
     yield _info("plr_sidecar_gone", "Sidecars that are gone, and why.", (*labels, "why"), why)
     yield _gauge("plr_sidecar_gone_timestamp_seconds", "When the sidecar was found to be gone.", labels, went)
 
@@ -233,7 +234,7 @@ def _servers(fleet: Fleet) -> Metric:
                 for path in ("up", "lost", "never"):
                     yield (member.name, path), float(counts[member.name, path])
 
-    text = "Robots that reach the server (up), or only others: those that reached it before (lost), or all (never)."
+    text = "Robots that reach the server (up), or reach only others: lost if they reached it before, never if none did."
     return _gauge("plr_server_robots", text, ("server", "path"), reach)
 
 
@@ -245,9 +246,9 @@ def _served(services: Sequence[tuple[NodeName, Sequence[ServedView], int]]) -> I
         yield from (((server, one.service), float(one.unanswered)) for server, found, _ in services for one in found)
 
     labels = ("server", "service")
-    text = "1 while a node beside the server's sidecar serves it; 0: its configuration names it, or it was served."
+    text = "1 while a ROS node at the server serves it, 0 if it is only configured, or was served before."
     yield _gauge("plr_server_service_up", text, labels, up)
-    text = "Requests in a row that the server had and did not answer, of those that robots measure."
+    text = "Consecutive requests, of those that robots measure, that the server received but did not answer."
     yield _gauge("plr_server_service_unanswered", text, labels, unanswered)
 
 
@@ -255,7 +256,7 @@ def _left_out(series: int) -> Metric:
     def rows() -> Iterator[tuple[Labels, float]]:
         yield (), float(series)
 
-    return _gauge("plr_fleet_series_left_out", "Series of robots and servers beyond their share.", (), rows)
+    return _gauge("plr_fleet_series_left_out", "Series of robots and servers left out as beyond their share.", (), rows)
 
 
 def _robots(rooms: Sequence[tuple[MemberView, _Room]]) -> Iterator[Metric]:
@@ -328,7 +329,7 @@ def _robots(rooms: Sequence[tuple[MemberView, _Room]]) -> Iterator[Metric]:
     path, service = ("robot", "interface", "server"), ("robot", "service")
     yield _gauge(
         "plr_robot_service_paths",
-        "Over how many paths requests of the robot's service go; 0: it wants the service, and none can be answered.",
+        "Paths that carry the requests of the robot's service; 0: it wants the service, but none can be answered.",
         service,
         served,
     )
@@ -340,7 +341,7 @@ def _robots(rooms: Sequence[tuple[MemberView, _Room]]) -> Iterator[Metric]:
     )
     yield _counter(
         "plr_robot_requests_missed_total",
-        "Those of them that missed their deadline or failed.",
+        "Requests of the robot that missed their deadline or failed, as it reports them.",
         service,
         counted(lambda miss: miss.missed),
     )
@@ -358,30 +359,30 @@ def _robots(rooms: Sequence[tuple[MemberView, _Room]]) -> Iterator[Metric]:
     )
     yield _gauge(
         "plr_target_miss_probability",
-        "What the robot's configuration wants, where it says so.",
+        "Highest miss probability that the robot's configuration allows, if it names one.",
         service,
         misses(target, (predicted, observed)),
     )
     yield _gauge("plr_robot_path_up", "1 while the robot's path answers, by its last report.", path, up)
     yield _info(
         "plr_robot_interface",
-        "Whose network the robot's interface uses: the carrier of its configuration, or the interface's own name.",
+        "The carrier of the robot's interface from its configuration, or else the interface's own name.",
         ("robot", "interface", "carrier"),
         interfaces,
     )
     yield _gauge(
         "plr_robot_interface_up",
-        "1 while the robot's interface carries something, 0 while it would be used and does not.",
+        "1 while the robot's interface carries something, 0 while the robot would use it but it carries nothing.",
         ("robot", "interface"),
         carrying,
     )
     yield _gauge(
         "plr_robot_mapping_synced", "1 while the robot has confirmed the mapping sent last.", ("robot",), follows
     )
-    yield _gauge("plr_robot_servers", "Servers that the robot was told of, as sent last.", ("robot",), servers)
+    yield _gauge("plr_robot_servers", "Servers in what the robot was last sent.", ("robot",), servers)
     yield _info(
         "plr_robot_mapping",
-        "Over which interfaces to which servers requests go.",
+        "Interfaces and servers that requests of the robot's service use.",
         ("robot", "service", "interface", "server"),
         mapped,
     )

@@ -100,12 +100,12 @@ class Metrics:
         )
         self.unknown_messages = prometheus_client.Counter(
             "plr_unknown_messages_total",
-            "Messages of sidecars left out since only a newer control plane knows their kind.",
+            "Messages of sidecars that were ignored because only a newer control plane knows their kind.",
             registry=self.registry,
         )
         self._refused_connections = prometheus_client.Counter(
             "plr_refused_connections_total",
-            "Connections and calls refused or ended because of who makes them or how, by reason.",
+            "Connections and calls refused or ended because of who made them or how, by reason.",
             ["reason"],
             registry=self.registry,
         )
@@ -116,7 +116,7 @@ class Metrics:
         """Whether the TLS files on disk are refused."""
         self.policy_reloads = prometheus_client.Counter(
             "plr_policy_reloads_total",
-            "Times the access policy was read again, by what came of it.",
+            "Times that the access policy was reloaded, by result.",
             ["result"],
             registry=self.registry,
         )
@@ -185,7 +185,7 @@ def _members(core: ControlCore) -> Iterable[Metric]:
     yield _gauge("plr_registered_sidecars", "Sidecars whose lease has not ended.", ["role"], registered)
     yield _counter(
         "plr_leases_postponed_total",
-        "Times that a lease was not ended yet, as its sidecar has unread bytes; of each a few at most.",
+        "Times that the end of a lease was postponed because the sidecar had unread bytes; a few at most for each.",
         [],
         {(): core.registry.postponed.counted},
     )
@@ -210,7 +210,8 @@ def _sync(core: ControlCore) -> Iterable[Metric]:
     # Count first and name the few results afterwards: naming thousands of states takes milliseconds.
     for (kind, state), count in Counter((kind, state) for _, kind, state in core.sync_states()).items():
         states[kind.value, state.name.lower()] += count
-    yield _gauge("plr_resource_sync", "Sidecars by how far they follow what was pushed.", ["resource", "state"], states)
+    text = "Sidecars by the state of what was pushed to them."
+    yield _gauge("plr_resource_sync", text, ["resource", "state"], states)
     yield _counter(
         "plr_nacks_total",
         "Pushed resources that a sidecar refused.",
@@ -253,13 +254,13 @@ def _plan(core: ControlCore) -> Iterable[Metric]:
     )
     yield _counter(
         "plr_relaxations_total",
-        "Plans taken that exceed capacities by another number of interfaces than the one before.",
+        "Plans put in force that exceed capacities by another number of interfaces than the previous one.",
         [],
         {(): core.counters.relaxations},
     )
     yield _counter(
         "plr_solves_unproven_total",
-        "Groups of assignments left further from their bound than wanted by the time limit.",
+        "Groups of assignments that the time limit left further from their bound than wanted.",
         [],
         {(): core.counters.unproven},
     )
@@ -305,7 +306,7 @@ def _events(events: EventLogState) -> Iterable[Metric]:
     yield _gauge("plr_events_kept", "Events of the fleet that are remembered.", [], {(): events.kept})
     yield _counter(
         "plr_event_write_failures_total",
-        "Times that the log of events could not be written.",
+        "Times that the event log could not be written.",
         [],
         {(): events.write_failures},
     )
@@ -320,13 +321,13 @@ def _certificate(
     now_wall = time.time()
     yield _gauge(
         "plr_certificate_expiry_timestamp_seconds",
-        "When the certificate in use ends, in seconds since 1970.",
+        "When the certificate in use expires, in seconds since 1970.",
         [],
         {(): own.not_after},
     )
     yield _gauge(
         "plr_tls_files_refused",
-        "1 while the certificate files on the disk are not taken, and those read before stay in use.",
+        "1 while the certificate files on the disk are refused and the previous ones stay in use.",
         [],
         {(): float(files_refused)},
     )
@@ -336,7 +337,7 @@ def _certificate(
 
 def _loop() -> Metric:
     """Return the processor time of the loop; must run on the loop's thread."""
-    text = "Processor time of the thread that serves all streams: it can have one core."
+    text = "Processor time of the thread that serves all streams; it can use one core."
     return _counter("plr_loop_cpu_seconds_total", text, [], {(): time.thread_time()})
 
 

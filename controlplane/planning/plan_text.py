@@ -51,11 +51,11 @@ def verdict(source: Source, prospects: Sequence[Prospect], target: float) -> Ite
     best = min(prospects, key=lambda found: found.joint)
     yield (
         f"no set meets {target:g}: the best, {_count(best.interfaces, 'interface')} and"
-        f" {_count(best.servers, 'server')} ({best.paths}), misses {best.joint:.2g},"
-        f" {best.joint / target:.2g} times as often"
+        f" {_count(best.servers, 'server')} ({best.paths}), misses with probability {best.joint:.2g},"
+        f" {best.joint / target:.2g} times the target"
     )
     if target * source.requests < 1.0:
-        yield f"{source.requests:.0f} requests can not show a probability of {target:g}: record more"
+        yield f"{source.requests:.0f} requests cannot show a probability of {target:g}: record more"
     single = min(prospects, key=lambda found: (found.interfaces, found.servers, found.joint))
     needed = paths_needed(single.joint, target)
     if needed is not None:

@@ -59,7 +59,8 @@ class AccessGuard(grpc.aio.ServerInterceptor):
             self._on_refused(WRONG_ROLE)
             name, role = caller.identity.name, caller.identity.role.value
             await context.abort(
-                grpc.StatusCode.PERMISSION_DENIED, f"the certificate of {name} is a {role}'s: it may not use {service}"
+                grpc.StatusCode.PERMISSION_DENIED,
+                f"the certificate of {name} has the role {role}, which may not use {service}",
             )
 
 

@@ -74,7 +74,7 @@ class AdminService:
         async for part in self._status(StatusQuery()):
             answer += part
             if len(answer) > MAX_STATUS_BYTES:
-                text = "the fleet is too large for one message: ask with a newer plr, which takes it in parts"
+                text = "the fleet is too large for one message: use a newer plr, which accepts it in parts"
                 await _abort(context, grpc.StatusCode.RESOURCE_EXHAUSTED, text)
         return bytes(answer)
 

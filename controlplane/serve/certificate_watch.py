@@ -83,7 +83,7 @@ class CertificateKeeper:
         try:
             self._gate.use(files)
         except ssl.SSLError as error:
-            log.error("the new certificate is not used, the old one stays: %s", error)
+            log.error("the new certificate is refused; the old one stays in use: %s", error)
         else:
             self._unfit = False
             self._metrics.own_certificate(files.identity, files.trust.lists())
@@ -120,6 +120,6 @@ class CertificateKeeper:
     def _relay_revocations(self, files: TlsFiles) -> None:
         crl = files.crl_pem or b""
         if len(crl) > MAX_CRL_BYTES:
-            log.error("%s/crl.pem is longer than %d bytes: sidecars are not told of it", files.directory, MAX_CRL_BYTES)
+            log.error("%s/crl.pem is longer than %d bytes: sidecars do not get it", files.directory, MAX_CRL_BYTES)
             return
         self._loop.relay_revocations(crl, revocation_set(files.trust.lists()))

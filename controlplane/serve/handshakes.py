@@ -20,13 +20,13 @@ HANDSHAKE_ABORTED = "handshake_aborted"
 HANDSHAKE_FAILED = "handshake_failed"
 
 _SSL_REASONS = {
-    "PEER_DID_NOT_RETURN_A_CERTIFICATE": (NO_CERTIFICATE, "the client shows no certificate"),
-    "UNSUPPORTED_PROTOCOL": (OLD_TLS, "the client speaks no TLS 1.3"),
-    "NO_PROTOCOLS_AVAILABLE": (OLD_TLS, "the client speaks no TLS 1.3"),
-    "WRONG_VERSION_NUMBER": (NOT_TLS, "the client speaks no TLS"),
-    "PACKET_LENGTH_TOO_LONG": (NOT_TLS, "the client speaks no TLS"),
-    "HTTP_REQUEST": (NOT_TLS, "the client speaks no TLS"),
-    "HTTPS_PROXY_REQUEST": (NOT_TLS, "the client speaks no TLS"),
+    "PEER_DID_NOT_RETURN_A_CERTIFICATE": (NO_CERTIFICATE, "the client presents no certificate"),
+    "UNSUPPORTED_PROTOCOL": (OLD_TLS, "the client does not use TLS 1.3"),
+    "NO_PROTOCOLS_AVAILABLE": (OLD_TLS, "the client does not use TLS 1.3"),
+    "WRONG_VERSION_NUMBER": (NOT_TLS, "the client does not use TLS"),
+    "PACKET_LENGTH_TOO_LONG": (NOT_TLS, "the client does not use TLS"),
+    "HTTP_REQUEST": (NOT_TLS, "the client does not use TLS"),
+    "HTTPS_PROXY_REQUEST": (NOT_TLS, "the client does not use TLS"),
 }
 
 
@@ -74,8 +74,8 @@ def why_failed(error: Exception) -> tuple[str, str]:
             return CLIENT_REFUSED, f"the client refuses us: {_words(reason.partition('_ALERT_')[2])}"
         return _SSL_REASONS.get(reason, (HANDSHAKE_FAILED, _words(reason) or str(error)))
     if isinstance(error, ConnectionAbortedError | TimeoutError):
-        return HANDSHAKE_TIMEOUT, "the client does not finish the TLS handshake"
-    return HANDSHAKE_ABORTED, "the client ended the connection within the TLS handshake"
+        return HANDSHAKE_TIMEOUT, "the client did not finish the TLS handshake"
+    return HANDSHAKE_ABORTED, "the client ended the connection during the TLS handshake"
 
 
 def _words(reason: str) -> str:

@@ -159,7 +159,7 @@ class ControlPlaneService:
             async with asyncio.timeout(REGISTER_TIMEOUT_S):
                 found = _first_message(await self._receive(context))
         except TimeoutError:
-            raise _StreamEndError(grpc.StatusCode.DEADLINE_EXCEEDED, "no registration came") from None
+            raise _StreamEndError(grpc.StatusCode.DEADLINE_EXCEEDED, "no registration arrived") from None
         if not isinstance(found, Registration):
             raise _StreamEndError(*found)
         registration = found
@@ -196,7 +196,7 @@ class ControlPlaneService:
             data = await self._receive(context)
             if not rate.take(len(data), time.monotonic()):
                 self._loop.refused(TOO_FAST)
-                raise _StreamEndError(grpc.StatusCode.RESOURCE_EXHAUSTED, "messages come too fast")
+                raise _StreamEndError(grpc.StatusCode.RESOURCE_EXHAUSTED, "messages arrive too fast")
             try:
                 parts: list[SidecarMessage]
                 try:

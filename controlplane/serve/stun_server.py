@@ -131,7 +131,7 @@ class StunServer:
                 # A bug of ours. It must not end the thread or write a log line for each datagram.
                 self.receive_failures += 1
                 if not self._failed:
-                    log.exception("STUN: a datagram of %s could not be answered; further ones are counted", peer)
+                    log.exception("STUN: a datagram of %s could not be answered; further ones are only counted", peer)
                 self._failed = True
                 continue
             if response is None:
@@ -181,7 +181,7 @@ def _bind_all(wanted: dict[tuple[socket.AddressFamily, Any], bool], port: int) -
                 except OSError as error:
                     if required or error.errno not in (errno.EAFNOSUPPORT, errno.EADDRNOTAVAIL):
                         raise
-                    log.warning("STUN: no IPv6 on this machine, answering over IPv4 only")
+                    log.warning("STUN: this machine has no IPv6, so answers go over IPv4 only")
         except OSError as error:
             for sock in sockets:
                 sock.close()

@@ -81,7 +81,7 @@ class FailureLog:
         if len(self._told) >= MAX_TOLD:
             self._told.clear()
         self._told[key] = now
-        log.error("%s of %s could not be solved, it keeps what it has: %r", key.service, key.robot, error)
+        log.error("%s of %s could not be solved and keeps its mapping: %r", key.service, key.robot, error)
 
 
 _failures = FailureLog()

@@ -42,7 +42,7 @@ def term_problem(files: TlsFiles, now_wall: float) -> TermProblem | None:
     if left_s >= SOON_S:
         return None
     what_to_do = _REMEDIES[EXPIRED].format(name=name)
-    return TermProblem(in_force=True, text=f"{path}: {in_words(left_s)} until it ends; {what_to_do}")
+    return TermProblem(in_force=True, text=f"{path}: expires in {in_words(left_s)}; {what_to_do}")
 
 
 def with_remedy(refusal: CertificateError, name: str) -> str:

@@ -30,7 +30,7 @@ def check_security(tls_dir: Path | None, insecure: bool) -> None:
     if tls_dir is None and not insecure:
         raise ValueError("tls_dir: expected the folder with this node's certificate (see: plr ca issue), but missing")
     if tls_dir is not None and insecure:
-        raise ValueError("insecure: expected without tls_dir: it is one or the other")
+        raise ValueError("insecure: expected without tls_dir; set one of the two")
 
 
 def check_absolute(path: Path) -> Path:
@@ -47,7 +47,7 @@ def encoded_path(text: str) -> bytes:
         name = os.fsencode(text)
     except UnicodeEncodeError:
         # JSON writes an emoji as two surrogates, which YAML reads as two characters; a locale may have few characters.
-        raise ValueError(f"expected a path, got one with characters that no name has here: {text!a}") from None
+        raise ValueError(f"expected a path, got one with characters that names cannot have here: {text!a}") from None
     if b"\0" in name:
         raise ValueError(f"expected a path, got one with a NUL: {text!a}")
     return name

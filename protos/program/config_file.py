@@ -94,7 +94,7 @@ def _count(node: yaml.Node, known: dict[int, int | None]) -> int:
     if id(node) in known:
         before = known[id(node)]
         if before is None:
-            raise _refused("no alias may stand in what it names", node)
+            raise _refused("an alias must not occur within what it names", node)
         return before
     known[id(node)] = None
     count = 1
@@ -103,7 +103,7 @@ def _count(node: yaml.Node, known: dict[int, int | None]) -> int:
     elif isinstance(node, yaml.MappingNode):
         count += sum(_count(key, known) + _count(value, known) for key, value in node.value)
     if count > MAX_VALUES:
-        raise _refused(f"no more than {MAX_VALUES} values, where an alias counts as what it names", node)
+        raise _refused(f"at most {MAX_VALUES} values, where an alias counts as what it names", node)
     known[id(node)] = count
     return count
 

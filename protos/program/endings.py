@@ -49,7 +49,7 @@ def ends_quietly(name: str) -> Callable[[Callable[P, int]], Callable[P, int]]:
                 if error.errno not in _NO_ROOM or error.filename is not None:
                     raise
                 print_no_more()
-                sys.stderr.write(f"{name}: what it prints cannot be written: {error.strerror}\n")
+                sys.stderr.write(f"{name}: its output cannot be written: {error.strerror}\n")
                 return EXIT_FAILURE
 
         return run

@@ -104,7 +104,7 @@ class MetricsServer:
             except OSError as error:
                 if not self._has_failed:
                     log.warning(
-                        "metrics_listen: cannot listen on %s port %d: %s; no metrics until it can (tried every %.0f s)",
+                        "metrics_listen: cannot listen on %s port %d: %s; no metrics until it can (retry: %.0f s)",
                         self._host, self._port, error.strerror or error, self._retry_s,
                     )  # fmt: skip
                 self._has_failed = True
@@ -112,7 +112,7 @@ class MetricsServer:
             server.set_app(self._app)
             self._server = server
         if self._has_failed:
-            log.info("metrics_listen: listens on %s port %d now", self._host, self._port)
+            log.info("metrics_listen: now listening on %s port %d", self._host, self._port)
 
     def _serve(self) -> None:
         # Not serve_forever: that checks only twice a second whether it should end, and keeps the caller waiting.

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
 
 def open_regular(path: Path, *, folder: int | None = None) -> BinaryIO:
-    """Open a file for reading; raise OSError, also if it is no regular file or nothing can have such a name.
+    """Open a file for reading; raise OSError, also if it is not a regular file or nothing can have such a name.
 
     `folder` is the descriptor of the folder that a relative path starts from.
     """
@@ -21,7 +21,7 @@ def open_regular(path: Path, *, folder: int | None = None) -> BinaryIO:
         # Without O_NONBLOCK, opening a FIFO would block until somebody writes to it.
         descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC, dir_fd=folder)
     except ValueError as error:
-        raise OSError(errno.EINVAL, "there is a NUL in its name") from error
+        raise OSError(errno.EINVAL, "its name contains a NUL") from error
     refuse_irregular(descriptor)
     return open(descriptor, "rb")
 
@@ -41,4 +41,4 @@ def refuse_irregular(descriptor: int) -> None:
 
 
 def _no_file() -> OSError:
-    return OSError(errno.EINVAL, "it is no regular file")
+    return OSError(errno.EINVAL, "it is not a regular file")

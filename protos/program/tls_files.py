@@ -124,7 +124,7 @@ def _node(directory: Path, trust: Trust, ca_pem: bytes, crl_pem: bytes | None) -
     key_pem = _read(key_path, KEY_FORBIDDEN)
     key = load_private_key(key_pem, None, key_path)
     if key.public_key() != certificate.public_key():
-        raise ConfigError(str(key_path), "", f"expected the key of {CERTIFICATE_FILE}; copy those that belong together")
+        raise ConfigError(str(key_path), "", f"expected the key of {CERTIFICATE_FILE}; copy two that belong together")
     return TlsFiles(
         directory=directory,
         certificate_pem=certificate_pem,
@@ -144,7 +144,7 @@ def _read(path: Path, forbidden: int) -> bytes:
         return read_guarded(path, forbidden)
     except ConfigError as error:
         if isinstance(error.__cause__, FileNotFoundError):
-            raise ConfigError(error.source, "", "there is no such file; copy what plr ca issue wrote there") from error
+            raise ConfigError(error.source, "", "there is no such file; copy the one of plr ca issue") from error
         if isinstance(error.__cause__, PermissionError):
             raise ConfigError(error.source, "", f"{error.problem}{_OWNER}") from error
         raise
@@ -192,7 +192,7 @@ def _refuse_shared(folder: Path) -> None:
     status = folder.stat()
     if status.st_mode & FORBIDDEN and (status.st_mode & stat.S_ISVTX or status.st_uid not in (0, os.geteuid())):
         # A folder such as /tmp, which has to stay writable for everybody.
-        problem = "everybody may write there: copy what plr ca issue wrote to a folder of its own, and name that"
+        problem = "everybody may write there; copy what plr ca issue wrote to a folder of its own, and name that one"
         raise ConfigError(str(folder), "", problem)
     _refuse_permissions(folder, status, FORBIDDEN)
 
@@ -229,7 +229,7 @@ class TlsWatch:
             self._refuse(fingerprint, refused)
             return None
         if self.refused is not None:
-            _log.info("the TLS files in %s are good again", self.current.directory)
+            _log.info("the TLS files in %s are valid again", self.current.directory)
         self._seen, self._broken, self.refused = fingerprint, None, None
         changed = files != self.current
         self.current = files
@@ -254,7 +254,7 @@ class TlsWatch:
     def _refuse(self, fingerprint: _Fingerprint, refused: RefusedFiles) -> None:
         if fingerprint == self._broken:
             after = "" if refused.start else ", and the next start fails"
-            _log.error("new TLS files are not used, the old ones stay%s: %s", after, refused.why)
+            _log.error("new TLS files are refused; the old ones stay in use%s: %s", after, refused.why)
             self._seen, self.refused = fingerprint, refused
         self._broken = fingerprint
 

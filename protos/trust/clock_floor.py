@@ -49,8 +49,8 @@ class ClockFloor:
         behind = wall < floor - SLACK_S
         if behind and not self._behind and self._alert is not None:
             self._alert(
-                f"this clock is behind what the CA has signed, by {floor - wall:.0f} s at least: "
-                "certificates are judged by that time instead; set the clock"
+                f"this clock is at least {floor - wall:.0f} s behind the time at which the CA last signed: "
+                "certificates are checked against that time instead; set the clock"
             )
         self._behind = behind
         return max(wall, floor)

@@ -127,7 +127,7 @@ def decode_credential(data: bytes) -> SessionCredential:
     name_end = _HEAD.size + name_bytes
     certificate_end = name_end + certificate_bytes
     if len(data) <= certificate_end or len(data) != certificate_end + 1 + data[certificate_end]:
-        raise DecodeError("credential of another length than it says")
+        raise DecodeError("credential whose length differs from what it says")
     try:
         name = node_name(data[_HEAD.size : name_end].decode("ascii"), "credential's name")
     except UnicodeDecodeError:
@@ -147,7 +147,9 @@ def verify(credential: SessionCredential, check: Callable[[bytes], Identity]) ->
     """
     identity = check(credential.certificate)
     if identity.name != credential.name or identity.role is not IdentityRole(credential.role.value):
-        raise CertificateError(WRONG_ROLE, f"a certificate of {identity.role.value} {identity.name} signs for another")
+        raise CertificateError(
+            WRONG_ROLE, f"a certificate of {identity.role.value} {identity.name} signs for another node"
+        )
     try:
         signer_key(credential.certificate).verify(
             credential.signature, _LABEL + credential._signed(), SIGNATURE_ALGORITHM

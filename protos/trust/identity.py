@@ -224,7 +224,7 @@ class Trust:
             except (ValueError, TypeError, InvalidSignature):
                 continue
             return authority
-        raise CertificateError(UNTRUSTED, "the certificate is of another CA")
+        raise CertificateError(UNTRUSTED, "the certificate is issued by another CA")
 
 
 def _load_authorities(pem: bytes) -> tuple[_Authority, ...]:
@@ -288,7 +288,7 @@ def _load_revocations(pem: bytes, authorities: tuple[_Authority, ...]) -> None:
             issuer.revoked.update(serials)
             known = True
     if not known:
-        raise CertificateError(UNTRUSTED, "the revocation list is of another CA")
+        raise CertificateError(UNTRUSTED, "the revocation list is issued by another CA")
 
 
 def _check_leaf(certificate: x509.Certificate) -> None:
@@ -331,7 +331,7 @@ def name_and_role(extensions: x509.Extensions, what: str) -> tuple[NodeName, Ide
         raise CertificateError(MALFORMED, str(error)) from error
     expected = [x509.DNSName(CONTROL_PLANE_DNS)] if role is IdentityRole.CONTROL_PLANE else []
     if others != expected:
-        raise CertificateError(MALFORMED, f"the {what} has alternative names that a {role.value} has not")
+        raise CertificateError(MALFORMED, f"the {what} has alternative names that a {role.value} must not have")
     return name, role
 
 
@@ -341,6 +341,6 @@ def _validity(certificate: x509.Certificate) -> tuple[float, float]:
 
 def _check_time(not_before: float, not_after: float, now_wall: float, what: str) -> None:
     if now_wall < not_before:
-        raise CertificateError(NOT_YET_VALID, f"{what} is not valid yet, for {in_words(not_before - now_wall)}")
+        raise CertificateError(NOT_YET_VALID, f"{what} is not valid for another {in_words(not_before - now_wall)}")
     if now_wall > not_after:
         raise CertificateError(EXPIRED, f"{what} expired {in_words(now_wall - not_after)} ago")

@@ -187,4 +187,6 @@ def test_plr_status_of_a_control_plane_of_the_version_before(capsys: pytest.Capt
     assert text.count("\nrobot-07 ") == 1, "the table of all"
     assert text.count("\nrobot-03:\n") == 2, "those named too"
     assert some == 1
-    assert errors == "plr: nobody is not registered; plr status shows who is, plr events --node nobody who was\n"
+    assert (
+        errors == "plr: nobody is not registered; plr status shows which are, plr events --node nobody shows its past\n"
+    )

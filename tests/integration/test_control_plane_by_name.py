@@ -54,11 +54,11 @@ pytestmark = [
 def test_a_silent_name_server_does_not_hide_what_stands_in_etc_hosts(tmp_path: Path) -> None:
     done = status(tmp_path, "control.test:50051", 8)
     assert done.returncode == 1
-    assert done.stderr.startswith("plr: control.test:50051: nobody listens there (TCP)")
+    assert done.stderr.startswith("plr: control.test:50051: nothing listens on this TCP port")
 
 
 def test_a_host_that_does_not_answer_is_told_with_what_to_do(tmp_path: Path) -> None:
     done = status(tmp_path, f"{SILENT}:50051", 0.5)
     assert done.returncode == 1
-    assert done.stderr.startswith(f"plr: {SILENT}:50051: no answer within 0.5 s: see whether")
+    assert done.stderr.startswith(f"plr: {SILENT}:50051: no answer within 0.5 s: check that")
     assert done.stderr.count("\n") == 1

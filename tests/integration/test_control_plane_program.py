@@ -148,7 +148,7 @@ def test_without_certificates_and_without_the_word_insecure_it_does_not_start(tm
     config = tmp_path / "neither.yaml"
     cases = {
         "log_level: info": "tls_dir: expected the folder",
-        "insecure: true\ntls_dir: /etc/plr/tls": "one or the other",
+        "insecure: true\ntls_dir: /etc/plr/tls": "set one of the two",
     }
     for text, told in cases.items():
         config.write_text(text)

@@ -158,9 +158,9 @@ def test_each_service_is_for_its_roles_only(plane: SecuredControlPlane) -> None:
         listed = reflect(channel)
         assert listed.code() is grpc.StatusCode.OK
     with open_channel(plane.address, r) as channel:
-        with plane.counted("wrong_role"), pytest.raises(grpc.RpcError, match=r"it may not use plr\.v1\.Admin"):
+        with plane.counted("wrong_role"), pytest.raises(grpc.RpcError, match=r"which may not use plr\.v1\.Admin"):
             admin_pb2_grpc.AdminStub(channel).GetStatus(admin_pb2.GetStatusRequest(), timeout=PATIENCE_S)
-        with plane.counted("wrong_role"), pytest.raises(grpc.RpcError, match=r"it may not use plr\.v1\.Admin"):
+        with plane.counted("wrong_role"), pytest.raises(grpc.RpcError, match=r"which may not use plr\.v1\.Admin"):
             list(status_parts(channel))
         with plane.counted("wrong_role"), pytest.raises(grpc.RpcError, match="ServerReflection"):
             reflect(channel)

@@ -82,7 +82,7 @@ def test_who_is_gone_is_shown_and_explained(alone: ControlPlaneProcess, capsys: 
     operator.wait_until(lambda: "cloud-a" in operator.gone())
     assert operator.gone()["cloud-a"] == "DEPARTURE_REASON_DRAINED"
     text = operator.ask("status")
-    assert "gone, the last first:" in text
+    assert "gone sidecars, newest first:" in text
     assert "lease_expired: silent for longer than its lease" in text
     assert kinds(operator.events("--node", "robot")) == ["connected", "stream_lost", "departed"]
     assert operator.events("--last", "1") == operator.events()[-1:]
@@ -91,7 +91,7 @@ def test_who_is_gone_is_shown_and_explained(alone: ControlPlaneProcess, capsys: 
     assert main(["status", "--insecure", "--address", alone.address, "rbot"]) == 1
     text, told = capsys.readouterr()
     assert "no sidecars" not in text
-    assert told == "plr: rbot is not registered; plr status shows who is, plr events --node rbot who was\n"
+    assert told == "plr: rbot is not registered; plr status shows which are, plr events --node rbot shows its past\n"
     assert "robot IS GONE" in operator.ask("explain", "robot", "/plan")
     alone.stop_flawless()
 

@@ -68,7 +68,7 @@ def test_refused_offers_are_logged_once_and_shown(plane: ControlPlaneProcess) ->
     with cloud(plane.address, "cloud-a"), cloud(plane.address, "cloud-b") as b, robot(plane.address) as r:
         r.peers("cloud-a")
         plane.wait_for_line(
-            "cloud-b offers /plan, which the policy does not let it",
+            "cloud-b offers /plan, which the policy does not allow",
             'missing under offers: {clouds: ["cloud-b"], services: ["/plan"]}',
         )
         b.peers()

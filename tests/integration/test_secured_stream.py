@@ -236,7 +236,7 @@ def test_what_the_operator_reads_of_a_sidecar_that_does_not_get_in(plane: Secure
     now = time.time()
     stranger = Authority.create()
     stranger.write_tls_dir(tmp_path / "other", "robot-1", IdentityRole.ROBOT)
-    assert f"is not of a CA in {tmp_path}/other/ca.pem" in failure(plane.address, tmp_path / "other")
+    assert f"is not issued by a CA in {tmp_path}/other/ca.pem" in failure(plane.address, tmp_path / "other")
     (tmp_path / "other" / "ca.pem").write_bytes(stranger.ca_pem + plane.authority.ca_pem)
     assert "it may not know our CA" in failure(plane.address, tmp_path / "other")
     past = Validity(now - 2 * HOUR_S, now - HOUR_S)
@@ -247,13 +247,13 @@ def test_what_the_operator_reads_of_a_sidecar_that_does_not_get_in(plane: Secure
     plane.authority.write_tls_dir(tmp_path / "good", "robot-good", IdentityRole.ROBOT)
     (tmp_path / "insecure").mkdir()
     with ControlPlaneProcess(tmp_path / "insecure") as insecure:
-        assert "speaks no TLS" in failure(insecure.address, tmp_path / "good")
+        assert "does not use TLS" in failure(insecure.address, tmp_path / "good")
     assert "Connection refused" in failure(insecure.address, tmp_path / "good")
 
 
 def test_a_name_that_is_not_the_certificates_is_refused_in_words(plane: SecuredControlPlane, tmp_path: Path) -> None:
     plane.authority.write_tls_dir(tmp_path / "tls", "robot-2", IdentityRole.ROBOT)
-    assert "the certificate is another name's" in failure(plane.address, tmp_path / "tls")
+    assert "the certificate has another name" in failure(plane.address, tmp_path / "tls")
 
 
 def plr(*arguments: str) -> subprocess.CompletedProcess[str]:
@@ -299,7 +299,7 @@ def test_plr_asks_with_an_operators_certificate(plane: SecuredControlPlane, tmp_
         assert "cloud-a" in shown.stdout
     denied = plr("status", "--address", plane.address, "--tls-dir", str(tmp_path / "robot"))
     assert denied.returncode == 1
-    assert "the certificate of robot-7 is a robot's: it may not use plr.v1.Admin" in denied.stderr
+    assert "the certificate of robot-7 has the role robot, which may not use plr.v1.Admin" in denied.stderr
     insecure = plr("status", "--address", plane.address, "--insecure")
     assert insecure.returncode == 1
     assert "it may expect TLS" in insecure.stderr

@@ -21,4 +21,4 @@ def test_the_mapping_follows_the_load_and_nothing_is_lost(tmp_path: Path) -> Non
     followed = swap_load(tmp_path, interfaces=1, before_s=5.0)
     assert followed.lost == 0
     assert followed.sent > 0
-    assert "moved as all copies would have missed with probability" in followed.reason
+    assert "moved because all copies would have missed with probability" in followed.reason

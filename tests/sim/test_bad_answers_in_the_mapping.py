@@ -1,4 +1,4 @@
-"""A cloud whose answers can not be delivered leaves the mapping of the robot that met it, and `plr explain` says so."""
+"""A cloud whose answers cannot be delivered leaves the mapping of the robot that met it, and `plr explain` says so."""
 
 from __future__ import annotations
 
@@ -60,10 +60,10 @@ def test_the_mapping_and_plr_explain_say_that_answers_are_bad() -> None:
     fleet = Fleet()
     fleet.call(3.0)
     assert fleet.servers(fleet.robot) == {"cloud-b"}
-    assert "answers of cloud-a can not be delivered" in fleet.mapping(fleet.robot).reason
+    assert "answers of cloud-a cannot be delivered" in fleet.mapping(fleet.robot).reason
     text = fleet.explained(fleet.robot)
     assert "up, PENALTY" in text
-    assert "servers whose answers can not be delivered: others go before them:" in text
+    assert "servers whose answers cannot be delivered: other servers come first:" in text
     assert "bad answer" in text
     assert "cloud-a" in fleet.servers(fleet.other), "what one robot says moves nobody else"
     assert "PENALTY" not in fleet.explained(fleet.other)
@@ -76,7 +76,7 @@ def test_a_server_that_was_mended_is_mapped_again() -> None:
     fleet.clouds[0].answer = lambda payload: payload
     fleet.call(FIRST_S + 30.0)
     assert "PENALTY" not in fleet.explained(fleet.robot)
-    assert "can not be delivered" not in fleet.mapping(fleet.robot).reason
+    assert "cannot be delivered" not in fleet.mapping(fleet.robot).reason
     for _ in range(int(LONGEST_S / 20)):
         fleet.call(20.0)
         if "cloud-a" in fleet.servers(fleet.robot):

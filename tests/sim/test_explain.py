@@ -126,7 +126,7 @@ def test_it_remembers_what_changed_and_why(world: World) -> None:
     assert after.changes[0].age_s <= 3.0
     assert after.in_force_s == pytest.approx(after.changes[0].age_s)
     assert [change.version for change in after.changes[1:]] == [change.version for change in before.changes]
-    assert "a path of it went or came" in after.changes[0].mapping.reason
+    assert "one of its paths came or went" in after.changes[0].mapping.reason
     down = next(pair for pair in after.pairs if pair.path == on("wlan0", "a"))
     assert (down.up, down.miss) == (False, None)
     assert after.changes[0].mapping.reason in render(after)

@@ -39,7 +39,7 @@ def test_it_stands_in_the_status_with_the_name_that_was_meant() -> None:
     world.run(SETTLED_S)
     statuses = world.core.status(world.now)
     assert [status.unmet for status in statuses] == [(), (WRONG,)]
-    assert "UNMET /plam: configured, and no server that it knows of offers it; did you mean /plan?" in render(statuses)
+    assert "UNMET /plam: configured, but no server that it knows offers it; did you mean /plan?" in render(statuses)
 
 
 def test_a_cloud_did_not_mean_what_it_offers() -> None:
@@ -47,7 +47,7 @@ def test_a_cloud_did_not_mean_what_it_offers() -> None:
     cloud = world.cloud("a")
     world.say(cloud, ServiceSet((offer(),), (), (WRONG,)))
     shown = render(world.core.status(world.now))
-    assert "UNMET /plam: configured, and no node there offers it, or none that can be called" in shown
+    assert "UNMET /plam: configured, but no node there offers it, or none that can be called" in shown
     assert "did you mean" not in shown
 
 
@@ -68,10 +68,10 @@ def test_a_service_whose_servers_are_not_reached_is_told_so_and_blames_no_name()
     world.say(robot, ServiceSet(unreached=(PLAN,)))
     world.run(SETTLED_S)
     shown = render(world.core.status(world.now))
-    assert "UNREACHED /plan: servers that it knows of offer it, and it reaches none of them" in shown
+    assert "UNREACHED /plan: servers that it knows offer it, but it reaches none of them" in shown
     assert "UNMET" not in shown
     assert not [event for event in events(world) if isinstance(event, UnmetNotice)]
-    text = r"^robot carries no /plan: it is offered by 2 clouds, and it reaches none of them; plr status robot shows"
+    text = r"^robot carries no /plan: 2 clouds offer it, but the robot reaches none of them; plr status robot shows"
     with pytest.raises(UnknownNameError, match=text):
         world.core.explain(NodeName("robot"), PLAN, world.now)
 
@@ -87,7 +87,7 @@ def test_explain_never_suggests_the_very_name(told: ServiceSet, calls: str) -> N
     with pytest.raises(UnknownNameError) as refused:
         world.core.explain(NodeName("robot"), PLAN, world.now)
     assert "did you mean" not in str(refused.value)
-    assert ("the policy keeps" in str(refused.value)) == (calls != "/plan")
+    assert ("the policy denies" in str(refused.value)) == (calls != "/plan")
 
 
 def test_a_type_that_is_not_installed_is_told_and_blames_no_name() -> None:
@@ -99,8 +99,8 @@ def test_a_type_that_is_not_installed_is_told_and_blames_no_name() -> None:
     world.say(robot, ServiceSet((), (use(),), untyped=(untyped,)))
     world.run(SETTLED_S)
     shown = render(world.core.status(world.now))
-    assert "UNTYPED /mark: not carried, as its service type is not installed there" in shown
-    assert "UNTYPED /arm: not offered, as its service type is not installed there" in shown
+    assert "UNTYPED /mark: not carried: its service type is not installed there" in shown
+    assert "UNTYPED /arm: not offered: its service type is not installed there" in shown
     with pytest.raises(UnknownNameError, match=r"^robot cannot carry /mark: its service type is not installed there"):
         world.core.explain(NodeName("robot"), untyped, world.now)
 

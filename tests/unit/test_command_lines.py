@@ -105,11 +105,11 @@ def test_who_asks_is_told_what_to_name(capsys: pytest.CaptureFixture[str]) -> No
 
 def test_the_stun_port_is_no_control_plane(capsys: pytest.CaptureFixture[str]) -> None:
     assert plr(["status", "--insecure", "--address", f"127.0.0.1:{free_port()}"]) == 1
-    assert "nobody listens there (TCP)" in capsys.readouterr().err
+    assert "nothing listens on this TCP port" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
-    ("name", "told"), [("fifo", "no regular file"), ("a" * 300, "name too long"), ("none", "No such file")]
+    ("name", "told"), [("fifo", "not a regular file"), ("a" * 300, "name too long"), ("none", "No such file")]
 )
 def test_a_trace_or_recording_that_is_none_is_not_waited_for(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], name: str, told: str

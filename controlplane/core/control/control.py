@@ -425,7 +425,7 @@ class ControlCore:
             if lifted:
                 self.departed.forget(name)
             else:
-                text = "connected, but the policy leaves it nobody to talk to; try: plr policy check"
+                text = "connected, but the policy lets it talk to nobody; try: plr policy check"
                 self.departed.note(self._departure(sidecar, Why.POLICY, text, now))
             self._events.append(CutOffNotice(name, sidecar.role, lifted))
 

@@ -108,7 +108,7 @@ class _Alternatives:
             return
         objective = self._problem.objective
         if block_cost(objective, block, choice) < block_cost(objective, block, self._running):
-            yield "better, not by enough to move"
+            yield "better, but not by enough to move"
 
     def _is_full(self, server: NodeName, load: int) -> bool:
         limit = self._problem.fleet_capacity.get(FleetKey(server, self._block.key.service))

@@ -67,7 +67,7 @@ def explain_departed(
     """Explain it; its times count from the departure. Raise UnknownNameError if it is forgotten, or knew none such."""
     if last is None:
         raise UnknownNameError(
-            f"{gone.name} is gone ({gone.why.value}), and what was known of it is forgotten; see: plr events --node "
+            f"{gone.name} is gone ({gone.why.value}), and what was known about it is forgotten; see: plr events --node "
             f"{gone.name}"
         )
     use = find_use(last.sidecar, service)

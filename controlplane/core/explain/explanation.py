@@ -99,15 +99,15 @@ def find_use(
             return use
     if service in robot.unreached:
         raise UnknownNameError(
-            f"{robot.name} carries no {service}: it is offered by {clouds} clouds, and it reaches none of them;"
+            f"{robot.name} carries no {service}: {clouds} clouds offer it, but the robot reaches none of them;"
             f" plr status {robot.name} shows the paths, and plr doctor there says more"
         )
     if service in robot.unmet:
-        what = f"{robot.name} is configured to carry {service}, and no cloud that it knows of offers it"
+        what = f"{robot.name} is configured to carry {service}, but no cloud that it knows offers it"
         if clouds:
-            raise UnknownNameError(f"{what}; {clouds} do with another type than it wants, or it has not met them yet")
+            raise UnknownNameError(f"{what}; {clouds} offer it with another type, or the robot does not know them yet")
         if service in offered:
-            raise UnknownNameError(f"{what}; the policy keeps those that do from it")
+            raise UnknownNameError(f"{what}; the policy denies it those that do")
         raise UnknownNameError(f"{what}{_nearest(service, offered)}")
     if service in robot.untyped:
         raise UnknownNameError(
@@ -116,9 +116,9 @@ def find_use(
     if service in offered:
         why = "its configuration does not name it, a node there serves it, or it reaches none of them"
         raise UnknownNameError(
-            f"{robot.name} carries no service {service}, and clouds offer it that it may call: {why}"
+            f"{robot.name} carries no service {service}, although clouds that it may call offer it: {why}"
             if clouds
-            else f"{robot.name} carries no service {service}, and the policy keeps those that offer it from it"
+            else f"{robot.name} carries no service {service}: the policy denies it the clouds that offer it"
         )
     known = [use.name for use in robot.uses] or offered
     raise UnknownNameError(f"{robot.name} carries no service {service}{_nearest(service, known)}")

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from plr.controlplane.core.explain.departed import Departure
     from plr.protos.model.ids import NodeName
 
-TEXT = "it was there before the control plane was restarted, and did not come back"
+TEXT = "it was there before the control plane was restarted, but did not come back"
 
 ENOUGH_WITNESSES = 2
 """Robots that must say that a server said goodbye, if as many may call it."""
@@ -78,10 +78,10 @@ class Returning:
         if witnesses and len(witnesses) >= min(could_say(gone.name), ENOUGH_WITNESSES):
             self._given_up.discard(gone.name)
             del self._witnesses[gone.name]
-            text = f"by what {_named(witnesses)} told, it said goodbye while the control plane was away"
+            text = f"{_named(witnesses)} reported that it said goodbye while the control plane was away"
             return replace(gone, why=Why.DRAINED, text=text)
         self._given_up.add(gone.name)
-        doubt = f"; {_named(witnesses)} alone told that it said goodbye" if witnesses else ""
+        doubt = f"; only {_named(witnesses)} reported that it said goodbye" if witnesses else ""
         return replace(gone, text=TEXT + doubt)
 
     def missing(self, now: float, who_could_say: Callable[[], Callable[[NodeName], int]]) -> list[Departure]:

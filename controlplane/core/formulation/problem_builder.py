@@ -494,7 +494,7 @@ def _inputs(
     elif not clouds:
         unserved = "the access policy lets this robot call it on no live server"
     elif not interfaces:
-        unserved = "the robot has told no address yet"
+        unserved = "the robot has announced no address yet"
     elif len(barred) == len(interfaces) * len(clouds):
         unserved = "the path rules let this robot use no path to a live server"
     else:

@@ -144,7 +144,7 @@ def _reason(block: BlockPlan, notes: BlockNotes, plan: Plan, objective: Objectiv
     if notes.surplus:
         parts.append(f"more interfaces than {MAX_PLANNED}: without {', '.join(notes.surplus)}")
     if notes.penalised:
-        parts.append(f"answers of {', '.join(notes.penalised)} can not be delivered: others go before")
+        parts.append(f"answers of {', '.join(notes.penalised)} cannot be delivered: other servers come first")
     if block.shared:
         parts.append(f"copies share {', '.join(block.shared)}")
     if block.excess:

@@ -18,7 +18,7 @@ class CloseReason(enum.Enum):
     LEASE_EXPIRED = "silent for longer than the lease"
     STOPPING = "the control plane is stopping"
     REVOKED = "the certificate is revoked"
-    CERTIFICATE_ENDED = "the certificate is not good any more"
+    CERTIFICATE_ENDED = "the certificate is no longer valid"
 
 
 @dataclass(frozen=True, slots=True)

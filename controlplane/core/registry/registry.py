@@ -54,14 +54,14 @@ class Refusal(enum.Enum):
     OLDER_INCARNATION = "a newer incarnation of this name is registered"
     NAME_TAKEN = (
         "another sidecar holds this name, and its lease has not ended: issue a certificate of its own to each node "
-        "(plr ca issue); one that was set up anew gets in when the lease has ended"
+        "(plr ca issue); a node that was set up again gets in when the lease has ended"
     )
     SESSION_TAKEN = "another sidecar has this session number: draw a new one"
     FULL = f"{MAX_SIDECARS} sidecars are registered, which is the limit"
-    TOO_OFTEN = "it registers too often: see why it starts or loses its connection all the time"
-    NAME_MISMATCH = "the certificate is another name's: set name to the certificate's, or leave it out"
-    WRONG_ROLE = "the certificate is for another role: set role to the certificate's, or leave it out"
-    BAD_CREDENTIAL = "the credential is not this run's, or not signed with this certificate"
+    TOO_OFTEN = "it registers too often: check why it keeps restarting or losing its connection"
+    NAME_MISMATCH = "the certificate has another name: set name to the certificate's, or leave it out"
+    WRONG_ROLE = "the certificate has another role: set role to the certificate's, or leave it out"
+    BAD_CREDENTIAL = "the credential is of another run, or is not signed with this certificate"
 
 
 @dataclass(frozen=True, slots=True)

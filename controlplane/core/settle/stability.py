@@ -265,13 +265,13 @@ def _missed_in_trouble(block: Block, choice: Choice) -> float:
 
 def _reason(difference: _Difference) -> str:
     if difference.old is None:
-        return "moved as a path of it went or came"
+        return "moved because one of its paths came or went"
     target = difference.block.target
     if target is not None:
         paid, pays = (charge(target, choice) for choice in (difference.old, difference.new))
         if pays < paid:
-            return f"moved as a request cost {paid:.3g}, now {pays:.3g}"
+            return f"moved because a request cost {paid:.3g}, now {pays:.3g}"
     then, now = (joint_miss(difference.block, choice) for choice in (difference.old, difference.new))
     if then <= now:
         return "moved to make room for others"
-    return f"moved as all copies would have missed with probability {then:.2g}, now {now:.2g}"
+    return f"moved because all copies would have missed with probability {then:.2g}, now {now:.2g}"

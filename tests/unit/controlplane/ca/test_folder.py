@@ -72,7 +72,7 @@ def test_a_key_that_others_may_read_is_refused(kept: AuthorityFolder) -> None:
 
 def test_a_ca_is_not_made_over_another(kept: AuthorityFolder) -> None:
     before = (kept.path / "index.json").read_bytes()
-    with pytest.raises(ConfigError, match="there is a CA already"):
+    with pytest.raises(ConfigError, match="already holds a CA"):
         kept.create(Authority.create())
     assert (kept.path / "index.json").read_bytes() == before
 
@@ -292,6 +292,6 @@ def test_a_fifo_in_a_nodes_folder_holds_up_nobody(tmp_path: Path) -> None:
         os.mkfifo(folder.node_folder("robot-1") / name)
     with folder.locked() as authority:
         (problem,) = folder.save(authority)
-        assert "it is no regular file" in problem
+        assert "it is not a regular file" in problem
         with pytest.raises(AuthorityError, match="holds another node's files"):
             refuse_taken(folder.node_folder("robot-1"), "robot-1", own=True)

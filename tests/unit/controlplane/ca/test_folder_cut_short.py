@@ -134,10 +134,10 @@ def test_a_fifo_in_the_place_of_a_list_is_not_waited_for(shell: Shell, tmp_path:
         path.unlink()
         os.mkfifo(path)
     shell("publish", "--dir", str(ca))
-    assert any("r1/crl.pem: not brought up to date" in line for line in shell.warnings)
+    assert any("r1/crl.pem: could not be updated" in line for line in shell.warnings)
     assert (ca / "crl.pem").is_file()
     os.mkfifo(tmp_path / "request.pem")
-    assert "no regular file" in shell("sign", str(tmp_path / "request.pem"), "--dir", str(ca), code=1)
+    assert "not a regular file" in shell("sign", str(tmp_path / "request.pem"), "--dir", str(ca), code=1)
 
 
 @pytest.mark.audit("ops-14")
@@ -164,7 +164,7 @@ def test_a_folder_that_cannot_be_brought_up_to_date_is_warned_of_and_stops_nothi
     shell("issue", "r1", "--role", "robot", "--dir", ca)
     (tmp_path / "ca" / "nodes" / "odd" / "crl.pem").mkdir(parents=True)
     shell("issue", "r2", "--role", "robot", "--dir", ca)
-    assert any("nodes/odd/crl.pem: not brought up to date: Is a directory" in line for line in shell.warnings)
+    assert any("nodes/odd/crl.pem: could not be updated: Is a directory" in line for line in shell.warnings)
     assert (tmp_path / "ca" / "nodes" / "r2" / "key.pem").exists()
     shell("revoke", "r1", "--dir", ca)
 

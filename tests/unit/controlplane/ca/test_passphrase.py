@@ -43,7 +43,7 @@ def test_a_passphrase_in_a_file_is_needed_by_every_command_that_signs(
 ) -> None:
     file = tmp_path / "passphrase"
     option = ["--passphrase-file", secret(file)]
-    assert "its key encrypted" in shell("init", *option)
+    assert "its key is encrypted" in shell("init", *option)
     assert protections(tmp_path) == [Protection.GOOD]
     error = shell("issue", "robot-1", "--role", "robot", code=2)
     assert "--passphrase-file" in error
@@ -82,7 +82,7 @@ def test_a_passphrase_that_protects_nothing_is_refused(shell: Shell, tmp_path: P
 def test_a_key_in_clear_is_warned_of_until_it_is_encrypted(
     shell: Shell, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, cheap_guesses: None
 ) -> None:
-    assert "its key not encrypted" in shell("init", "--no-passphrase")
+    assert "its key is not encrypted" in shell("init", "--no-passphrase")
     shell("issue", "robot-1", "--role", "robot")
     (warning,) = shell.warnings
     assert warning.endswith("the CA's key is not encrypted; do: plr ca passphrase --dir plr-ca\n")
@@ -108,7 +108,7 @@ def test_a_key_as_it_was_encrypted_before_still_opens(
     monkeypatch.setenv("PLR_CA_PASSPHRASE", PASSPHRASE)
     shell("issue", "robot-1", "--role", "robot")
     (warning,) = shell.warnings
-    assert warning.endswith("cheap to guess at; do: plr ca passphrase --dir plr-ca\n")
+    assert warning.endswith("encrypted by an old, weak method; do: plr ca passphrase --dir plr-ca\n")
     # The same passphrase will do: it is encrypted as it is today.
     monkeypatch.setenv("PLR_CA_NEW_PASSPHRASE", PASSPHRASE)
     shell("passphrase")

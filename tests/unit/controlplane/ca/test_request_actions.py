@@ -114,7 +114,7 @@ def test_at_a_terminal_the_operator_sees_it_and_types_the_role(
     result, said, _ = at_a_terminal(tmp_path, f"{typed}\n", "sign", request)
     assert result == code, said
     assert "robot-1, which has no certificate yet" in said
-    assert "operator, which may ask the control plane about everybody" in said
+    assert "operator, which may ask the control plane about every node" in said
     assert "SHA256:" in said
     assert issued(ca) == (1 if code == 0 else 0)
 
@@ -157,7 +157,7 @@ def test_a_key_serves_one_node_only(shell: Shell, tmp_path: Path, ca: Path) -> N
     shutil.copytree(tmp_path / "node", tmp_path / "copy")
     request = asked(shell, "copy", "robot-2", "robot", "--keep-key")
     error = shell("sign", request, "--name", "robot-2", "--role", "robot", code=1)
-    assert "the request's key is the one of robot-1" in error
+    assert "the request's key belongs to robot-1" in error
 
 
 def test_a_stolen_key_does_not_come_back(shell: Shell, ca: Path) -> None:
@@ -205,7 +205,7 @@ def test_a_file_that_is_no_request_is_one_line(
 
 
 def test_an_endless_file_is_not_read_to_its_end(shell: Shell, ca: Path) -> None:
-    assert "it is no regular file" in shell("sign", "/dev/zero", *ROBOT, code=1)
+    assert "it is not a regular file" in shell("sign", "/dev/zero", *ROBOT, code=1)
 
 
 def test_no_ca_and_no_file_are_told(shell: Shell, ca: Path) -> None:

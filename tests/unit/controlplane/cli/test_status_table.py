@@ -80,7 +80,7 @@ def test_fallbacks_are_shown_where_there_are_any() -> None:
 def test_refused_offers_are_shown() -> None:
     peer = Peer(NodeName("cloud-a"), Role.CLOUD, SessionId(2), b"", 1, offers=(offer(), offer("/secret")))
     cloud = SidecarStatus(peer, True, 1.0, "", refused_offers=(ServiceName("/secret"),))
-    assert "REFUSED by the policy: /secret (offered here, told to no robot)" in render([cloud])
+    assert "REFUSED by the policy: /secret (offered here, announced to no robot)" in render([cloud])
 
 
 def test_who_lacks_a_revocation_is_seen() -> None:
@@ -90,7 +90,7 @@ def test_who_lacks_a_revocation_is_seen() -> None:
     text = render([status], RevocationSet((HeldList(5, 12, 87_400),)), 87_400.0 + 8640.0)
     assert text.splitlines()[0] == "control plane: revocation list 12, signed 0.1 days ago"
     assert "revocation list 11, signed 1.1 days ago: OLDER than the control plane's 12" in text
-    assert "REVOCATION LIST TOO OLD of 1 CAs: talks to none of their nodes; do: plr ca publish" in text
+    assert "REVOCATION LIST TOO OLD of 1 CAs: it talks to none of their nodes; do: plr ca publish" in text
     assert "signed 1000 s FROM NOW: a clock is wrong" in render([status], now_wall=0.0)
 
 
@@ -104,10 +104,10 @@ def test_what_one_member_claims_of_revocation_lists_is_told_of_that_member_alone
     claims = [holds("evil", 2**64 - 1), holds("strange", 1, ca=6)]
     text = render([holds("honest", 12), *claims], own, 1000.0)
     assert "OLDER" not in text
-    assert text.count("which the control plane has not") == 2
+    assert text.count("which the control plane does not have") == 2
     told = text.split("\n\n")
     assert told[1] == "honest:\n  revocation list 12, signed 0.0 days ago"
-    assert told[2].startswith(f"evil:\n  claims revocation list {2**64 - 1}, which the control plane has not")
+    assert told[2].startswith(f"evil:\n  claims revocation list {2**64 - 1}, which the control plane does not have")
 
 
 @pytest.mark.audit("ops-12")

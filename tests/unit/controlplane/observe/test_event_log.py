@@ -190,7 +190,7 @@ def test_what_was_left_out_of_a_members_share_is_said(tmp_path: Path) -> None:
     log.record(EventKind.CONNECTED, ROBOT, role=Role.ROBOT)
     left_out = log.state.too_often
     assert left_out > 100
-    assert f"and {left_out} events before it" in log.events()[-1].text
+    assert f"and {left_out} earlier events" in log.events()[-1].text
 
 
 def test_a_question_is_answered_with_what_it_asks_for() -> None:

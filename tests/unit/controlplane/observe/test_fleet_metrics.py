@@ -268,7 +268,7 @@ def test_a_server_that_answers_nobody_is_told_of_until_it_answers_somebody() -> 
     assert reports(other, lost=4) == 6.0, "of two neither counts for more than the other"
     (status,) = world.core.status(world.now, [NodeName("a")])
     assert status.unanswered == {PLAN: 6}
-    assert f"UNANSWERED {PLAN}: had the last 6 requests" in render([status])
+    assert f"UNANSWERED {PLAN}: received the last 6 requests" in render([status])
     of_both = (histogram(0.01), histogram(lost=9))
     latencies = [
         latency(nic, "a", Histogram(), processing=of) for nic, of in zip(("wlan0", "wwan0"), of_both, strict=True)

@@ -259,7 +259,7 @@ def test_it_reads_what_explain_printed(tmp_path: Path, capsys: pytest.CaptureFix
         (("--traces", "DIR", "--deadline-ms", "9", "--request-bytes", "0"), "from 1 to 16777216, got '0'"),
         (("--recorded", "DIR/one.csv"), "not an answer of plr explain --json"),
         (("--recorded", "DIR/none.json"), "none.json"),
-        (("--recorded", "DIR/one.csv", "--rate-hz", "5"), "go with --traces"),
+        (("--recorded", "DIR/one.csv", "--rate-hz", "5"), "need --traces"),
     ],
 )
 def test_what_makes_no_sense_is_refused(

@@ -33,16 +33,16 @@ def ca() -> Authority:
     ("left_s", "in_force", "said"),
     [
         (SOON_S + 1, None, ""),
-        (SOON_S - 1, True, "cert.pem: 7 days until it ends; renew it beside the CA, with: plr ca renew robot-1, and"),
-        (90_000.0, True, "cert.pem: 25 hours until it ends; "),
-        (100.0, True, "cert.pem: 100 seconds until it ends; "),
+        (SOON_S - 1, True, "cert.pem: expires in 7 days; renew it beside the CA, with: plr ca renew robot-1, and"),
+        (90_000.0, True, "cert.pem: expires in 25 hours; "),
+        (100.0, True, "cert.pem: expires in 100 seconds; "),
         (
             -60.0,
             False,
             "cert.pem: nobody talks to this node: the certificate of robot-1 expired 60 seconds ago; renew",
         ),
         (-864_006.0, False, "expired 10 days ago; renew"),
-        (math.inf, False, "not valid yet, for 100 seconds; set this host's"),
+        (math.inf, False, "not valid for another 100 seconds; set this host's"),
     ],
 )
 def test_the_terms_of_a_certificate(
@@ -99,6 +99,6 @@ def test_a_configuration_with_an_ended_certificate_is_refused_and_one_that_ends_
         )
         assert shown.err.count("\n") == 1
     elif left_days < 7:
-        assert shown.err.startswith(f"{name}: warning: {tmp_path}/tls/cert.pem: 2 days until it ends; renew it")
+        assert shown.err.startswith(f"{name}: warning: {tmp_path}/tls/cert.pem: expires in 2 days; renew it")
     else:
         assert shown.err == ""

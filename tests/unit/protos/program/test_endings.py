@@ -51,9 +51,7 @@ def test_a_reader_that_has_gone_is_no_error(argv: list[str]) -> None:
 @pytest.mark.skipif(not FULL.exists(), reason="needs /dev/full")
 def test_a_full_disk_is_one_line() -> None:
     with FULL.open("wb") as full, run(PROGRAMS[0], full.fileno()) as program:
-        assert program.communicate(timeout=60)[1] == (
-            b"plr: what it prints cannot be written: No space left on device\n"
-        )
+        assert program.communicate(timeout=60)[1] == (b"plr: its output cannot be written: No space left on device\n")
     assert program.returncode == 1
 
 

@@ -57,7 +57,7 @@ def other_ca() -> Authority:
 
 Breakage = tuple[str, "Callable[[Path], object]", str]
 BREAKAGES: list[Breakage] = [
-    ("key.pem", lambda path: path.unlink(), "there is no such file; copy what plr ca issue wrote there"),
+    ("key.pem", lambda path: path.unlink(), "there is no such file; copy the one of plr ca issue"),
     ("key.pem", lambda path: path.chmod(0o604), "others may read or change it; do: chmod 600 "),
     ("key.pem", lambda path: path.chmod(0o641), "others may read or change it; do: chmod 640 "),
     ("key.pem", lambda path: path.chmod(0o602), "others may read or change it; do: chmod 600 "),
@@ -81,17 +81,17 @@ BREAKAGES: list[Breakage] = [
     (
         "cert.pem",
         lambda path: path.write_bytes(other_ca().issue("robot-1", IdentityRole.ROBOT).certificate_pem),
-        "of another CA; issue one with the CA of ca.pem",
+        "by another CA; issue one with the CA of ca.pem",
     ),
     ("ca.pem", lambda path: path.unlink(), "there is no such file"),
     ("ca.pem", lambda path: path.chmod(0o666), "everybody may change it"),
     ("ca.pem", lambda path: path.write_bytes(b""), "copy the ca.pem of the CA's folder there"),
     ("crl.pem", lambda path: path.chmod(0o666), "everybody may change it"),
     ("crl.pem", lambda path: path.write_bytes(b""), "copy the crl.pem of the CA's folder there"),
-    ("crl.pem", lambda path: path.write_bytes(other_ca().crl_pem()), "of another CA; copy the crl.pem"),
+    ("crl.pem", lambda path: path.write_bytes(other_ca().crl_pem()), "by another CA; copy the crl.pem"),
     ("", lambda path: path.chmod(0o777), "everybody may change it; do: chmod 775 "),
     # Such as /tmp, which has to stay as it is.
-    ("", lambda path: path.chmod(0o1777), "everybody may write there: copy what plr ca issue wrote to a folder of its"),
+    ("", lambda path: path.chmod(0o1777), "everybody may write there; copy what plr ca issue wrote to a folder of its"),
     ("", lambda path: path.rename(path.with_name("elsewhere")), "expected a folder with cert.pem, key.pem and ca.pem"),
 ]
 
@@ -234,7 +234,7 @@ def test_the_same_files_put_back_are_refused_no_more(folder: Path, caplog: pytes
         (folder / "ca.pem").write_bytes(content)
         assert watch.poll() is None
     assert refused_by(watch) is None
-    assert "are good again" in caplog.text
+    assert "are valid again" in caplog.text
 
 
 @pytest.mark.audit("ops-14")

@@ -205,8 +205,8 @@ def test_one_robot_of_several_hides_no_dead_server_and_two_are_believed() -> Non
     world.run(5.0 + world.settings.lease_s + 1.0)
     assert why(world) == {"soon": Why.DRAINED, "late": Why.LEASE_EXPIRED}
     texts = {str(gone.name): gone.text for gone in world.core.departed}
-    assert texts["soon"] == "by what robot, other told, it said goodbye while the control plane was away"
-    assert texts["late"].endswith("did not come back; robot alone told that it said goodbye")
+    assert texts["soon"] == "robot, other reported that it said goodbye while the control plane was away"
+    assert texts["late"].endswith("did not come back; only robot reported that it said goodbye")
     world.say(liar, Report(goodbyes=(NodeName("late"),)))
     assert why(world)["late"] is Why.LEASE_EXPIRED
     world.say(other, Report(goodbyes=(NodeName("late"),)))

@@ -178,7 +178,7 @@ def test_a_dead_path_moves_no_robot_that_is_not_in_the_way() -> None:
     settled = settled_of(problem, make_plan(problem, {alive.key: (0,), dying.key: (1,)}), old)
     assert settled.blocks[alive.key].assignments == (("if0", "cloud-1"),)
     assert settled.blocks[dying.key].assignments == (("if0", "cloud-1"),)
-    assert settled.blocks[dying.key].why == "moved as a path of it went or came"
+    assert settled.blocks[dying.key].why == "moved because one of its paths came or went"
     assert settled.blocks[alive.key].why == ""
 
 
@@ -230,7 +230,7 @@ def test_every_change_says_why_until_the_next_one() -> None:
     better = make_plan(later, {one.key: (1,), two.key: (0,)})
     for now in (1.0, 2.0):
         plan = stability.settle(later, better, plan, now)
-        assert plan.blocks[two.key].why == "moved as all copies would have missed with probability 0.9, now 0.001"
+        assert plan.blocks[two.key].why == "moved because all copies would have missed with probability 0.9, now 0.001"
         assert plan.blocks[one.key].why == "moved to make room for others"
 
 
@@ -264,7 +264,7 @@ def test_copies_come_and_go_when_the_target_is_surely_missed_or_surely_met(
     settled = settled_of(problem, solve(problem, time_limit_s=60), old)
     assert len(settled.blocks[part.key].assignments) == (3 - copies if changes else copies)
     if copies == 2 and changes:
-        assert settled.blocks[part.key].why == "moved as a request cost 2, now 1"
+        assert settled.blocks[part.key].why == "moved because a request cost 2, now 1"
 
 
 def test_a_shared_region_is_left_although_that_misses_more() -> None:

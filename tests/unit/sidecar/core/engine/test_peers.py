@@ -247,12 +247,12 @@ class Judge:
         return math.inf
 
 
-EARLY = CertificateError(NOT_YET_VALID, "not valid yet, for 99 s")
+EARLY = CertificateError(NOT_YET_VALID, "not valid for another 99 s")
 
 
 def test_refused_peers_are_taken_once_they_are_judged_good() -> None:
     judge = Judge()
-    judge.wrong = {A: EARLY, B: CertificateError(UNTRUSTED, "of another CA")}
+    judge.wrong = {A: EARLY, B: CertificateError(UNTRUSTED, "issued by another CA")}
     peers = judge.peers
     assert peers.apply(view(*HELD), nobody) is None
     assert peers.names() == []
@@ -273,7 +273,10 @@ def test_one_dropped_when_trust_changed_comes_back_with_its_trust_unless_the_vie
     peers = judge.peers
     peers.apply(view(*HELD), nobody)
     peers.apply(view(HELD[0]), everybody)
-    judge.wrong = {A: CertificateError(UNTRUSTED, "of another CA"), B: CertificateError(UNTRUSTED, "of another CA")}
+    judge.wrong = {
+        A: CertificateError(UNTRUSTED, "issued by another CA"),
+        B: CertificateError(UNTRUSTED, "issued by another CA"),
+    }
     judge.own.forget_admitted()
     assert peers.recheck() == [A, B]
     judge.wrong.clear()
