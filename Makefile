@@ -14,7 +14,7 @@ export ROS_AUTOMATIC_DISCOVERY_RANGE ?= LOCALHOST
 
 .PHONY: help setup demo test quick fuzz lint format protos pages interfaces lock bench bench-quick bench-dataplane bench-churn bench-insiders bench-control bench-fleet-day bench-matcher clean distclean
 
-help: ## this list
+help: ## show this list
 	@echo 'usage: make TARGET'
 	@echo
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):[^#]*## (.*)/\1\t\2/' | while IFS=$$'\t' read -r target what; do printf '  %-15s %s\n' "$$target" "$$what"; done
@@ -24,22 +24,22 @@ help: ## this list
 	@echo "  make demo DEMO_ARGS='--help'"
 	@echo "  make bench-dataplane BENCH_ARGS='--help'"
 
-setup: ## Debian packages, .venv, locked dependencies, example interfaces (the other targets run it)
+setup: ## install Debian packages, .venv, locked dependencies, example interfaces (the other targets run it)
 	@deploy/dev/setup.sh
 
-demo: setup ## a robot keeps its deadline while a link, a server and the control plane die (about two minutes)
+demo: setup ## show a robot that keeps its deadline while a link, a server and the control plane die (about two minutes)
 	@$(PY) -m lab.demo $(DEMO_ARGS)
 
-test: setup ## all tests
+test: setup ## run all tests
 	@deploy/dev/test.sh $(PYTEST_ARGS)
 
-quick: setup ## what changed since COMMIT=main: lint, its unit tests, a slice of the simulations (a minute)
+quick: setup ## check what changed since COMMIT=main: lint, its unit tests, a slice of the simulations (a minute)
 	@deploy/dev/quick.sh $(COMMIT)
 
-fuzz: setup ## a million junk datagrams for each fuzzing test (10 minutes, as root)
+fuzz: setup ## run each fuzzing test with a million junk datagrams (10 minutes, as root)
 	@$(PY) -m pytest tests/fuzz tests/attacks/test_fuzz.py --fuzz-datagrams 1000000 $(PYTEST_ARGS)
 
-lint: setup ## ruff, mypy, import rules, drift of stubs and pages
+lint: setup ## run ruff, mypy and the import rules, and compare the generated stubs and pages
 	@deploy/dev/lint.sh
 
 format: setup ## rewrite the sources the way lint wants them
@@ -54,31 +54,31 @@ pages: setup ## write the keys and the figures of the code into docs/use/configu
 
 interfaces: setup ## build examples/plr_demo_interfaces into .venv
 
-lock: setup ## lock dependencies anew from pyproject.toml (LOCK_ARGS=--upgrade for newer versions)
+lock: setup ## lock the dependencies of pyproject.toml again (LOCK_ARGS=--upgrade for newer versions)
 	@deploy/dev/lock.sh $(LOCK_ARGS)
 
-bench: setup ## every measurement one after the other, reports into bench/results (hours, as root)
+bench: setup ## run every measurement, one after the other; reports go to bench/results (hours, as root)
 	@$(PY) -m bench $(BENCH_ARGS)
 
-bench-quick: setup ## 15 s of a drive with every contender: direct ROS 2, MPTCP, zenoh, ours (5 minutes at most, as root)
+bench-quick: setup ## run 15 s of a drive with every contender: direct ROS 2, MPTCP, zenoh, ours (5 minutes at most, as root)
 	@$(PY) -m bench evaluate --quick $(BENCH_ARGS)
 
-bench-dataplane: setup ## the data plane against its targets, beside TCP, MPTCP, QUIC and zenoh (20 minutes, as root)
+bench-dataplane: setup ## compare the data plane with its targets, and with TCP, MPTCP, QUIC and zenoh (20 minutes, as root)
 	@$(PY) -m bench dataplane $(BENCH_ARGS)
 
-bench-churn: setup ## interfaces, servers, control plane come and go for ten minutes under small, large and slow calls: nothing is lost, nothing grows
+bench-churn: setup ## let interfaces, servers and the control plane come and go for ten minutes under load: nothing is lost, nothing grows
 	@$(PY) -m bench churn $(BENCH_ARGS)
 
-bench-insiders: setup ## two members of the fleet attack the others in every way at once for ten minutes: nothing is lost (as root)
+bench-insiders: setup ## let two members attack the fleet in every way at once for ten minutes: nothing is lost (as root)
 	@$(PY) -m bench insiders $(BENCH_ARGS)
 
-bench-control: setup ## the control plane with 500, 1,000, 2,000 and 4,000 sidecars: a restart, steady load, a dead server (20 minutes)
+bench-control: setup ## measure the control plane with 500 to 4,000 sidecars: a restart, steady load, a dead server (20 minutes)
 	@$(PY) -m bench control $(BENCH_ARGS)
 
-bench-fleet-day: setup ## 24 simulated hours of a fleet of 1,000 that joins, leaves, roams and loses servers: nothing drifts, nothing grows
+bench-fleet-day: setup ## simulate 24 hours of a fleet of 1,000 that joins, leaves, roams and loses servers: nothing drifts, nothing grows
 	@$(PY) -m bench fleet-day $(BENCH_ARGS)
 
-bench-matcher: setup ## the matcher's predictions against recorded networks, and its speed, and the real system while two servers swap load (half an hour)
+bench-matcher: setup ## compare the matcher's predictions with recorded networks, and measure its speed and reaction (half an hour)
 	@$(PY) -m bench matcher $(BENCH_ARGS)
 
 clean: ## remove caches and build output

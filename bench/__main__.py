@@ -10,7 +10,7 @@ examples:
   make bench-fleet-day BENCH_ARGS='--members 100 --hours 6'  does anything drift or grow in a day?
   make bench-quick                                         15 s of a drive with every contender
   python -m bench evaluate --scenario 'drive-*' --contender plr-replicate
-  python -m bench report --out bench/results               verdicts, page and summary anew from the records of runs
+  python -m bench report --out bench/results               makes verdicts, page and summary again from the records
   python -m bench report --out DIR --again DIR2 --publish  compares two evaluations; writes the figures into the docs
   python -m bench scenarios --traces ~/traces              what the evaluation replays
   make bench-matcher BENCH_ARGS='--traces ~/traces'        are the matcher's predictions true?

@@ -87,7 +87,7 @@ def _parser() -> argparse.ArgumentParser:
         metavar="IF=P,..",
         help="its path for each interface (%(default)s)",
     )
-    parser.add_argument("--repeat", action="store_true", help="begin the trace anew at its end")
+    parser.add_argument("--repeat", action="store_true", help="repeat the trace from its start")
     actions = parser.add_subparsers(dest="action", metavar="up | shell | exec | calibrate")
     up = actions.add_parser("up", help="draw it, show live statistics, take commands from stdin (default)")
     up.add_argument("--every", type=float, default=2.0, metavar="S", help="seconds between statistics")

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 MAX_GROWTH_MB = 4.0
 """Tolerated growth over the second half of a run, by a straight line through the minimum of each minute, less twice its
 standard error. It is above the allocator's steps and far below a leak of one object for each request of ten minutes.
-Answers of 16 MB come and go, hence the minimum: what remains between them is what adds up."""
+Answers of 16 MB come and go, so the minimum counts: what remains between them is what adds up."""
 LEAST_OF_S = 60.0
 MAX_MORE_THREADS = 2
 """Tolerated growth in threads: gRPC starts and ends threads of its own."""

@@ -42,7 +42,7 @@ QUIET_S = 240.0
 
 RESTARTS_UNTIL = 0.3
 """Share of the day with restarts. One control plane runs through the rest, so that anything that grows has long to do
-so; it is killed once more at the end."""
+so; it is killed again at the end."""
 
 SPELL_S = (20.0, 100.0)
 """How long a member refuses, reads slowly or has no network."""

@@ -7,7 +7,7 @@
         OCTET STRING }                                                     the key's PrivateKeyInfo, padded (PKCS #7)
 
 The library reads this, and so does OpenSSL (`openssl pkey -in key.pem`). But the library writes PKCS #8 with nothing
-better than 2,048 rounds of PBKDF2. Hence the few bytes of DER here.
+better than 2,048 rounds of PBKDF2. So there are a few bytes of DER here.
 """
 
 from __future__ import annotations

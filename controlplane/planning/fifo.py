@@ -94,7 +94,7 @@ class FifoLink:
     def send(self, at: float, size: int, rng: random.Random) -> float:
         """Return when a message of `size` bytes sent `at` has arrived; inf if it is lost or the queue has no room.
 
-        Each packet is lost with the step's probability. A lost packet is sent once more, a round trip after it left. If
+        Each packet is lost with the step's probability. A lost packet is sent again, a round trip after it left. If
         it is lost again, the message is lost.
         """
         used = max(self._work, self.capacity_by(at))

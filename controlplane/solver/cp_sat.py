@@ -4,8 +4,8 @@ OR-Tools is imported when it is first needed, or once there is time for it (`pre
 second of processor time, and after a restart, when a whole fleet comes back, most problems do not need it.
 
 Columns are whole choices of a block, so that every objective is linear. With one worker and a fixed seed, the same
-columns give the same answer in the same version of OR-Tools. CP-SAT releases the interpreter while it searches, hence
-a thread suffices to run it.
+columns give the same answer in the same version of OR-Tools. CP-SAT releases the interpreter while it searches, so a
+thread suffices to run it.
 """
 
 from __future__ import annotations

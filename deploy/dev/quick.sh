@@ -33,7 +33,7 @@ if ((${#sources[@]})); then
   .venv/bin/ruff format --check --quiet "${sources[@]}" || status=1
   .venv/bin/mypy --no-error-summary || status=1
   .venv/bin/lint-imports --cache-dir .import_linter_cache >/dev/null 2>&1 || {
-    echo "quick: an import points upward: .venv/bin/lint-imports says which" >&2
+    echo "quick: an import points upward; .venv/bin/lint-imports names it" >&2
     status=1
   }
 fi

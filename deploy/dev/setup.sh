@@ -31,7 +31,7 @@ find_python() {
       return
     fi
   done
-  fail "needs CPython 3.11 or 3.12 (on Debian 12: apt-get install python3)"
+  fail "CPython 3.11 or 3.12 is needed (on Debian 12: apt-get install python3)"
 }
 
 # Prints the Debian packages that are missing, one a line. Looks for what they bring, not for their names: a tool that
@@ -102,7 +102,7 @@ fi
 
 python=$(find_python)
 if [[ -x $venv/bin/python ]] && ! supported "$venv/bin/python"; then
-  say "$venv does not work any more: making it anew"
+  say "$venv no longer works: making it again"
   rm -rf "$venv"
 fi
 base=$python
@@ -113,11 +113,11 @@ fi
 mapfile -t missing < <(missing_packages "$base")
 if ((${#missing[@]})); then
   if [[ ${PLR_SYSTEM_PACKAGES:-} == skip ]]; then
-    say "going on without Debian packages: ${missing[*]}"
+    say "continuing without these Debian packages: ${missing[*]}"
   elif ((EUID == 0)) && command -v apt-get >/dev/null; then
     install_packages "${missing[@]}"
   else
-    fail "as root, first: apt-get install --no-install-recommends ${missing[*]}   (or set PLR_SYSTEM_PACKAGES=skip)"
+    fail "run first, as root: apt-get install --no-install-recommends ${missing[*]}   (or set PLR_SYSTEM_PACKAGES=skip)"
   fi
 fi
 

@@ -17,7 +17,7 @@ parallel=(--dist loadfile --no-loadscope-reorder --durations 15)
 
 failed=() unsteady=()
 
-# run NAME PROCESSES ARGUMENT... - run tests; what fails is tried once more, alone. These tests happen in real time, on machines
+# run NAME PROCESSES ARGUMENT... - run tests; what fails is tried again, alone. These tests happen in real time, on machines
 # that do other things too and stand still for a second now and then. A defect fails twice; so do more than eight.
 run() {
   local name=$1 processes=$2 cache=.pytest_cache/${1// /-} status count
@@ -31,7 +31,7 @@ run() {
     failed+=("$name")
     return
   fi
-  printf 'test: %d of %s failed: once more, alone\n' "$count" "$name" >&2
+  printf 'test: %d of %s failed; trying again, alone\n' "$count" "$name" >&2
   unsteady+=("$(.venv/bin/python -c 'import json, sys; print(*json.load(open(sys.argv[1])))' "$cache/v/cache/lastfailed")")
   "${pytest[@]}" -o cache_dir="$cache" --last-failed "$@" || failed+=("$name")
 }
@@ -40,7 +40,7 @@ run "emulated networks" "$at_once" -m "netns and not busy" "${emulated[@]}"
 run "busy networks" 1 -m "netns and busy" "${emulated[@]}"
 run "all others" "$at_once" -m "not netns"
 if ((${#unsteady[@]})); then
-  printf 'test: failed at first, tried again: %s\n' "${unsteady[*]}" >&2
+  printf 'test: failed at first and tried again: %s\n' "${unsteady[*]}" >&2
 fi
 if ((${#failed[@]})); then
   printf 'test: failed: %s\n' "$(

@@ -81,7 +81,7 @@ class Histogram:
 
     __slots__ = ("_counts", "_lost", "_sparse")
 
-    # Mutable: equal by content, hence not hashable.
+    # Mutable: equal by content, so not hashable.
     __hash__ = None  # type: ignore[assignment]  # Python's own way to say so
 
     def __init__(self) -> None:

@@ -5,7 +5,7 @@ warm-up is cut in the middle of the network, both ways: for a contender that use
 use. The clients are bare programs, ours a sidecar's engine with the application in its process; every server answers
 on the thread that received the request.
 
-Ours and plain UDP run once more with real-time priority on processors that do not sleep (`_steady_`): the difference is
+Ours and plain UDP run again with real-time priority on processors that do not sleep (`_steady_`): the difference is
 the cost of the machine's other work and its sleep.
 """
 

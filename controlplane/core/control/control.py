@@ -73,8 +73,8 @@ RESTLESS_DELAY_S = 1.0
 """Delay of publication for a member that comes and goes beyond its share."""
 
 PUBLISH_DELAY_S = 0.02
-"""Delay from a change of the members to the sets that tell of it: a sidecar announces its addresses and its services in
-two messages, and these should make one version."""
+"""Delay from a change of the members to the sets that announce it: a sidecar announces its addresses and its services
+in two messages, and these should make one version."""
 
 
 PUBLISH_DELAY_EACH_S = 50e-6
@@ -84,7 +84,7 @@ PUBLISHED_AT_ONCE = 200
 """Sidecars examined for news in one go: some milliseconds, for which streams wait."""
 
 TOLD_AT_ONCE = 64
-"""Sidecars told of a new revocation list in one go."""
+"""Sidecars that are sent a new revocation list in one go."""
 
 _CLOSED_FOR = {
     RemovalReason.REVOKED: CloseReason.REVOKED,
@@ -171,7 +171,7 @@ class ControlCore:
         if result.new_run:
             self._forget_paths(name)
             self._begin_serving(name)
-        self._tell_anew(name, before, now)
+        self._tell_again(name, before, now)
         self._publisher.begin_stream(registration)
         self._welcome(name, stream)
         self._came_or_went(name, registration.role, now)
@@ -222,7 +222,7 @@ class ControlCore:
         return told
 
     def _told_bytes(self, name: NodeName, told: Iterable[CandidateSet | ServiceSet]) -> int:
-        """Return how many bytes each listener is told of a member if it announces this; 0 if it is no news."""
+        """Return how many bytes about a member each listener is sent if it announces this; 0 if it is no news."""
         known = self.registry.get(name)
         if known is None:
             return 0
@@ -231,7 +231,7 @@ class ControlCore:
             after = after.having_said(one)
         return 0 if known.ready and after.as_peer() == known.as_peer() else after.told_bytes
 
-    def _tell_anew(self, name: NodeName, before: Sidecar | None, now: float) -> None:
+    def _tell_again(self, name: NodeName, before: Sidecar | None, now: float) -> None:
         """Note that a member has registered: others are told what it said before, if that is within its share."""
         sidecar = self.registry.get(name)
         if sidecar is None or before is None or sidecar.as_peer() == before.as_peer():
@@ -284,7 +284,7 @@ class ControlCore:
             change = Change.PATH
         if change is not Change.REPORT:
             if self._drawing.is_urgent(name) or self.urgency.take(name, self._drawing.cost(name), now):
-                self._drawing.robot_changed(name, anew=surprised)
+                self._drawing.robot_changed(name, estimate_again=surprised)
             else:
                 change = Change.REPORT
         self._debounce.note(change, now)
@@ -346,7 +346,7 @@ class ControlCore:
         self.registry.lease_s = self.pacing.lease_s
 
     def relay_revocations(self, crl: bytes, now: float) -> None:
-        """Pass this list (PEM) on to all: a sidecar may know peers that this run has never heard of."""
+        """Pass this list (PEM) on to all: a sidecar may know peers that this run does not know."""
         if crl == self._crl:
             return
         self._crl = crl
@@ -702,7 +702,7 @@ class ControlCore:
         return self._publisher.sync_states()
 
     def view(self, name: NodeName, now: float) -> MemberView | None:
-        """Return what the metrics tell of a member; None if it is no longer present."""
+        """Return what the metrics say about a member; None if it is no longer present."""
         sidecar = self.registry.get(name)
         if sidecar is None:
             return None

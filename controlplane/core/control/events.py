@@ -50,7 +50,7 @@ class Counters:
     interfaces_left_out: int = 0
     """Interfaces announced by robots beyond those that any mapping may use."""
     old_stream_messages: int = 0
-    """Messages on a stream that no longer is the sidecar's."""
+    """Messages on a stream that is no longer the sidecar's."""
     offers_refused: int = 0
     """Newly known offers that the policy does not let their clouds make."""
     solved: int = 0

@@ -100,7 +100,7 @@ class Evidence:
 
 
 class _Service:
-    """Sizes of one robot's requests of a service, and how long these have been heard of."""
+    """Sizes of one robot's requests of a service, and for how long these have been reported."""
 
     __slots__ = ("clock", "sizes")
 
@@ -184,7 +184,7 @@ class Estimator:
         self._times: dict[tuple[NodeName, ServiceName], ServerTimes] = {}
         """Computed ..."""
         self._parts: dict[tuple[ServiceName, Asked], Parts] = {}
-        """... like what there is to tell of each path of this robot ..."""
+        """... like what is known of each path of this robot ..."""
         self._worked_out_of: _Robot | None = None
         self._worked_out_at = (0, 0.0)
         """... from this many reports, at this time."""
@@ -346,7 +346,7 @@ class Estimator:
 
     def counted(self, robot: NodeName, service: ServiceName) -> tuple[int, int]:
         """Return how many of the robot's requests ended, and how many of these missed their deadline or failed. Both
-        restart at 0 after the robot has not been heard of for long."""
+        restart at 0 after the robot has not reported for long."""
         tables = self._robots.get(robot)
         count = tables.outcomes.get(service) if tables is not None else None
         return (count.requests, count.missed) if count is not None else (0, 0)

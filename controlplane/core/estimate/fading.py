@@ -102,7 +102,7 @@ class FadedHistogram:
     """Weights of the buckets of `plr.protos.base.histogram` and of the lost, fading with a half-life in seconds.
 
     Called-off samples count for as long as they lasted: `distribution` follows Kaplan and Meier. With the clock of its
-    group, a histogram fades faster while only others of the group are heard of.
+    group, a histogram fades faster while only others of the group are reported.
     """
 
     __slots__ = (
@@ -182,7 +182,7 @@ class FadedHistogram:
         return self.aged(now) * self._silence.kept()
 
     def aged(self, now: float) -> float:
-        """Return the same as if its group had not been heard of since."""
+        """Return the same as if nothing of its group had been reported since."""
         return self._total * math.exp2((self._at - now) / self._half_life_s)
 
     def scaled(self, now: float, sample: int) -> Histogram:

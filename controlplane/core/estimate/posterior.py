@@ -127,14 +127,14 @@ class _Streaks:
 
 
 class FadedTrials:
-    """Trials and those of them that missed, fading, with what they tell of the next one.
+    """Trials and those of them that missed, fading, with what they predict for the next one.
 
     Several memories of different lengths run in parallel. Each shorter one starts from the ratio of the longer one
     before it. All are averaged by how well they predicted recently: their weights are proportional to the likelihood of
     what came, as in Bayesian model averaging with forgetting. Misses come in streaks, so n trials say less than n
     independent ones. The design effect is the variance of the prediction's errors over batches of `BATCH_S` relative to
     that of independent trials, times (1 + r) / (1 - r) for the correlation r of neighbouring batches; the trials are
-    worth n divided by it. With the clock of their group they fade faster while only others of the group are heard of.
+    worth n divided by it. With the clock of their group they fade faster while only others of the group are reported.
     """
 
     __slots__ = ("_at", "_half_life_s", "_memories", "_silence", "_streaks")

@@ -29,7 +29,7 @@ ENOUGH_REQUESTS = 50.0
 """Number of requests from which a server's own times stand alone."""
 
 DOUBTED_REQUESTS = 0.25
-"""Remaining worth of a server's times after another one has changed, if it was heard of ..."""
+"""Remaining worth of a server's times after another one has changed, if it was reported ..."""
 
 HEARD_REQUESTS, LATELY_HALF_LIFE_S = 1.6, 2.0
 """... less often than this recently, fading with this half-life: by exploration alone, not by use."""
@@ -86,7 +86,7 @@ class _OfService:
 
 
 class ComputeTimes:
-    """Fading processing times of every server, and what a service's servers usually need, for those not heard of.
+    """Fading processing times of every server, and what a service's servers usually need, for those not reported.
 
     A server that has changed is known only by what came since.
     """
@@ -148,7 +148,7 @@ class ComputeTimes:
         return True
 
     def _doubt_others(self, service: ServiceName, of_service: _OfService, now: float) -> None:
-        """Discount servers hardly heard of recently: load moved, and nobody knows from where or to where."""
+        """Discount servers hardly reported recently: load moved, and nobody knows from where or to where."""
         for name, times in of_service.servers.items():
             of_server = self._servers[name, service]
             if of_server.lately.weight(now) < HEARD_REQUESTS:
@@ -157,7 +157,7 @@ class ComputeTimes:
                 times.forget(DOUBTED_REQUESTS / max(times.weight(now), DOUBTED_REQUESTS))
 
     def _forget_old(self, now: float) -> None:
-        """Forget servers not heard of for long: new ones may keep coming, and all count for the usual times."""
+        """Forget servers not reported for long: new ones may keep coming, and all count for the usual times."""
         since = now - forget_after_s(self._half_life_s)
         while True:
             oldest, of_server = next(iter(self._servers.items()))

@@ -1,8 +1,8 @@
-"""Decides how much of old evidence still counts when one thing has not been heard of while its group has.
+"""Decides how much of old evidence still counts when one thing has not been reported while its group has.
 
 What keeps being measured fades slowly, as its past is worth something beside its present. A server that nobody asks any
-more may be idle by now, or busy: the longer its group was asked without it, the less its past tells of its present (a
-restless bandit, Whittle 1988). Pauses in which none of the group was heard of do not count.
+more may be idle by now, or busy: the longer its group was asked without it, the less its past says of its present (a
+restless bandit, Whittle 1988). Pauses in which none of the group was reported do not count.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ LONGEST_GAP_S = 2.0
 
 
 class HeardClock:
-    """How long a group of similar things has been heard of: seconds without pauses."""
+    """How long a group of similar things has been reported: seconds without pauses."""
 
     __slots__ = ("_at", "seconds")
 
@@ -29,13 +29,13 @@ class HeardClock:
         self._at = now
 
     def hear(self, now: float) -> None:
-        """Note that one of them was heard of; call this before counting it."""
+        """Note that one of them was reported; call this before counting it."""
         self.seconds += min(now - self._at, LONGEST_GAP_S)
         self._at = now
 
 
 class Silence:
-    """How long one of the group has not been heard of, by the group's clock; without a clock there is no silence."""
+    """How long one of the group has not been reported, by the group's clock; without a clock there is no silence."""
 
     __slots__ = ("_clock", "_since")
 

@@ -75,7 +75,7 @@ class Departure:
     why: Why
     at: float
     seen_at: float
-    """When it was last heard of."""
+    """When it was last heard from."""
     text: str = ""
     software_version: str = ""
     services: tuple[ServiceName, ...] = ()

@@ -82,7 +82,7 @@ class MemberView:
     misses: tuple[MissView, ...] = ()
     interfaces: tuple[InterfaceView, ...] = ()
     paths_of_services: tuple[tuple[ServiceName, int], ...] = ()
-    """Over how many paths requests go, for each service that it was told of or cannot have."""
+    """Number of paths of its requests, for each service that it was offered or cannot have."""
     lost: frozenset[NodeName] = frozenset()
     """Servers that it does not reach but once did."""
     unproven: frozenset[NodeName] = frozenset()
@@ -92,7 +92,7 @@ class MemberView:
     follows: bool = True
     """Whether it has confirmed the mapping that it was last sent, if there is one."""
     servers: int = 0
-    """How many servers a robot was told of: registered ones on which the policy lets it call something."""
+    """How many servers a robot was sent: registered ones on which the policy lets it call something."""
     served: tuple[ServedView, ...] = ()
     """What a server that is not about to leave serves, preceded by what it should serve but does not."""
 

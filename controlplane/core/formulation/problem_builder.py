@@ -109,7 +109,7 @@ class _Work:
     """A robot that is being drawn."""
 
     robot: NodeName
-    anew: bool
+    estimate_again: bool
     urgent: bool
     uses: list[tuple[BlockKey, _Inputs]]
     """Uses still to be drawn, the last one first."""
@@ -182,7 +182,7 @@ class Drawing:
         self._rests: dict[NodeName, list[tuple[BlockKey, _Inputs]]] = {}
         """Remaining uses of robots that wait for another picture with some of them, ..."""
         self._first: dict[NodeName, BlockKey] = {}
-        """... or, for a robot to be drawn whole once more, the use to begin with: all of them get their turn."""
+        """... or, for a robot to be drawn whole again, the use to begin with: all of them get their turn."""
 
     # ── what changed ──
 
@@ -190,14 +190,14 @@ class Drawing:
         """Note that a sidecar, its addresses or services, or the policy changed."""
         self._frame = self._looking = None
 
-    def robot_changed(self, robot: NodeName, *, anew: bool = True) -> None:
+    def robot_changed(self, robot: NodeName, *, estimate_again: bool = True) -> None:
         """Draw this robot in the next picture whatever it costs.
 
-        Unless `anew`, pairs that it already has may keep their estimates: its paths changed, not what is known of them.
+        Unless `estimate_again`, existing pairs may keep their estimates: its paths changed, not what is known of them.
         They do when many robots changed at once, as when a server dies: all need other mappings within a second, and
         are re-estimated in their turn.
         """
-        self._urgent[robot] = anew or self._urgent.get(robot, False)
+        self._urgent[robot] = estimate_again or self._urgent.get(robot, False)
         self._draw_whole(robot)
 
     def is_urgent(self, robot: NodeName) -> bool:
@@ -236,7 +236,7 @@ class Drawing:
         self._put_back()
         for robot, work in self._aside.items():
             if work.urgent and robot not in self._urgent and (robot in self._rests or robot in self._first):
-                self._urgent[robot] = work.anew
+                self._urgent[robot] = work.estimate_again
         self._aside.clear()
         self._urgent_order.clear()
         self._urgent_drawn = self._routine_pairs = 0
@@ -297,7 +297,7 @@ class Drawing:
         if work.steps is None:
             if not work.uses:
                 return 0.0
-            work.steps = self._draw_use(*work.uses.pop(), estimator, now, anew=work.anew)
+            work.steps = self._draw_use(*work.uses.pop(), estimator, now, estimate_again=work.estimate_again)
         try:
             return next(work.steps)
         except StopIteration:
@@ -319,7 +319,7 @@ class Drawing:
         found = self._next_robot(lost)
         if found is None:
             return None
-        robot, anew, urgent = found
+        robot, estimate_again, urgent = found
         uses = list(frame.uses.get(robot, ()))
         rest = self._rests.pop(robot, None)
         if rest is not None:
@@ -327,10 +327,10 @@ class Drawing:
         elif (first := self._first.pop(robot, None)) is not None:
             begin = next((number for number, (key, _) in enumerate(uses) if key == first), 0)
             uses = uses[begin:] + uses[:begin]
-        if anew or robot not in self._at:
+        if estimate_again or robot not in self._at:
             self._at[robot] = now
             self._surprise.pop(robot, None)
-        return _Work(robot, anew, urgent, uses[::-1])
+        return _Work(robot, estimate_again, urgent, uses[::-1])
 
     def _next_robot(self, lost: Callable[[NodeName], float]) -> tuple[NodeName, bool, bool] | None:
         """Return the robot to draw next, whether to re-estimate it, and whether it is urgent; None if the picture is
@@ -364,7 +364,7 @@ class Drawing:
         """Redraw a partly drawn robot, beginning with the use that was being drawn."""
         if self._work is not None:
             work, self._work = self._work, None
-            self.robot_changed(work.robot, anew=work.anew)
+            self.robot_changed(work.robot, estimate_again=work.estimate_again)
 
     def picture(self) -> Picture:
         """Return what was drawn."""
@@ -419,7 +419,7 @@ class Drawing:
             uses[robot.name] = tuple(found)
             self._looked_at[robot.name] = _LookedAt(robot, uses[robot.name])
             if any(key not in self._drawn or self._drawn[key].inputs != inputs for key, inputs in found):
-                self.robot_changed(robot.name, anew=False)
+                self.robot_changed(robot.name, estimate_again=False)
             looked_at += 1
             if looked_at % LOOKED_AT_ONCE == 0:
                 yield
@@ -452,7 +452,7 @@ class Drawing:
         return robot in self._surprise or now - self._at.get(robot, now) >= STALE_S
 
     def _draw_use(
-        self, key: BlockKey, inputs: _Inputs, estimator: Estimator, now: float, *, anew: bool
+        self, key: BlockKey, inputs: _Inputs, estimator: Estimator, now: float, *, estimate_again: bool
     ) -> Generator[float, None, None]:
         """Draw a use; yields like `draw_block`."""
         before = self._drawn.get(key)
@@ -460,7 +460,7 @@ class Drawing:
             servers = tuple(cloud.name for cloud in inputs.clouds)
             self._drawn[key] = _Drawn(inputs, None, BlockNotes(servers, unserved=inputs.unserved))
             return
-        kept = before is not None and not anew and before.inputs.use == inputs.use
+        kept = before is not None and not estimate_again and before.inputs.use == inputs.use
         known = (before.block, before.notes) if before is not None and before.block is not None and kept else None
         block, notes = yield from draw_block(
             inputs.robot,

@@ -1,4 +1,4 @@
-"""Limits members that register all the time: all others are told of each registration, and it is logged.
+"""Limits members that register all the time: each registration is announced to all others and logged.
 
 One beyond the member's share is refused: its sidecar tries again a little later, as after every refusal.
 """
@@ -17,10 +17,10 @@ STARTS_BURST = 30.0
 """A day of somebody who looks for a mistake, in minutes."""
 
 STARTS_PER_S = 0.2
-"""Rate after that. All others are told of a start, with all that the member offers."""
+"""Rate after that. A start is announced to all others, with all that the member offers."""
 
 RETURN_COST = 0.2
-"""Cost, in starts, of a run that only connects again, of which nobody need be told: one a second."""
+"""Cost, in starts, of a run that only connects again, which is not announced: one a second."""
 
 
 class RegistrationShare:

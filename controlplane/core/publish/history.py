@@ -30,7 +30,7 @@ class SentMapping:
 
 @dataclass(slots=True)
 class History:
-    """What one robot was told of one service."""
+    """What one robot was sent for one service."""
 
     since: float
     """When its requests last changed their destinations."""
@@ -65,5 +65,5 @@ class MappingHistory:
             history.changes.appendleft(SentMapping(now, sent.version, mapping))
 
     def of(self, key: BlockKey) -> History | None:
-        """Return what a robot was told of a service, the newest first; None if that is forgotten."""
+        """Return what a robot was sent for a service, the newest first; None if that is forgotten."""
         return self._histories.get(key)

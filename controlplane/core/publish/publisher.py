@@ -98,7 +98,7 @@ class Publisher:
             self._held_back[name] = None
 
     def changed(self, name: NodeName, role: Role) -> None:
-        """Note that what this sidecar is told, or what others are told of it, may have changed."""
+        """Note that what this sidecar is sent, or what others are sent about it, may have changed."""
         self._due.add(name)
         if role is Role.CLOUD:
             self._all_due = True

@@ -24,7 +24,7 @@ C = TypeVar("C")
 
 @dataclass(frozen=True, slots=True)
 class PeerView:
-    """What a sidecar is told of its peers."""
+    """What a sidecar is sent about its peers."""
 
     peers: tuple[Peer, ...]
     policy: int = POLICY_PENDING
@@ -164,7 +164,7 @@ class Snapshots:
     def send_peers(
         self, view: PeerView, told: ToldPeers, removed: tuple[RemovedPeer, ...], base: Version, versions: VersionSource
     ) -> PeerSet:
-        """Send the sidecar its peers; `told` are those that it is told: all of the view's, or what changed upon `base`.
+        """Send the sidecar its peers; `told` are those that it is sent: all of the view's, or the changes since `base`.
 
         `removed` names those that it may know and that the view does not have.
         """
@@ -184,7 +184,7 @@ class Snapshots:
         return self.peers if resource is ResourceKind.PEERS else self.mapping
 
     def send_refused_again(self) -> bool:
-        """Mark what is refused as due once more, as wanted then, and as a new version. Return whether anything is."""
+        """Mark what is refused as due again, as wanted then, and as a new version. Return whether anything is."""
         for track in (self.peers, self.mapping):
             track.send_again = track.refused
         return self.peers.send_again or self.mapping.send_again

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 
 class ToldPeers(Sequence["Peer"]):
-    """What the sidecar of this name and role is told of `peers`, which have their own tokens."""
+    """What the sidecar of this name and role is sent about `peers`, which have their own tokens."""
 
     __slots__ = ("_name", "_peers", "_role")
 

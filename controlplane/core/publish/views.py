@@ -1,8 +1,8 @@
-"""Computes what each sidecar is told of the others: those of the other role that are ready, as far as the policy lets
-it have to do with them. Views are made for one publication, so that what many are told alike is made once.
+"""Computes what each sidecar is sent about the others: those of the other role that are ready, as far as the policy
+allows contact with them. Views are made for one publication, so that what many are sent alike is made once.
 
-- A robot is told of the clouds on which it may call something, with the offers it may call.
-- A cloud is told of the robots that may call something on it, each with what that is.
+- A robot is sent the clouds on which it may call something, with the offers it may call.
+- A cloud is sent the robots that may call something on it, each with what that is.
 """
 
 from __future__ import annotations
@@ -90,7 +90,7 @@ class Views:
         self._servers: dict[Group, Mapping[NodeName, CallPermit]] = {}
 
     def peers_of(self, sidecar: Sidecar) -> tuple[Peer, ...]:
-        """Return the peers a sidecar is told of, by name."""
+        """Return the peers a sidecar is sent, by name."""
         if sidecar.role is Role.CLOUD:
             if sidecar.name not in self._of_clouds:
                 self._of_clouds[sidecar.name] = self._robots_for(sidecar)
@@ -105,7 +105,7 @@ class Views:
         return peers
 
     def servers_of(self, robot: NodeName) -> Mapping[NodeName, CallPermit]:
-        """Return the clouds a robot is told of, and what it may call there."""
+        """Return the clouds a robot is sent, and what it may call there."""
         group = self._permits.group(robot)
         servers = self._servers.get(group)
         if servers is None:

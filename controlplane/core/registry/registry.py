@@ -177,7 +177,7 @@ class Sidecar:
         return size + sum(_OFFER_BYTES + len(offer.name) + len(offer.type) for offer in self.offers)
 
     def as_peer(self) -> Peer:
-        """Return what its peers are told of it, with its own token; each is told the one made for it (`ToldPeers`)."""
+        """Return what its peers are sent about it, with its own token; each gets the one made for it (`ToldPeers`)."""
         # A signature of the previous run or certificate is invalid under this credential: the sidecar announces again
         # in a moment, and until then each peer continues with what it has.
         stale = bool(self.candidates_signature) and self.signed_under != self.registration.credential
@@ -467,6 +467,6 @@ class Registry:
 
 
 def _tells_anything(registration: Registration, before: Registration) -> bool:
-    """Return whether all others are to be told of what a sidecar registers with, apart from what it holds itself."""
+    """Return whether a registration changes anything for others: what it holds itself does not."""
     held = replace(before, peers_version=registration.peers_version, mapping_version=registration.mapping_version)
     return registration != held

@@ -1,4 +1,4 @@
-"""Limits members that change what they announce all the time: every change is told to all others.
+"""Limits members that change what they announce all the time: every change is sent to all others.
 
 So each member has its share. A change within it counts at once. One beyond it waits, and only the last of its kind
 does. Each change repeats all that others know of the member: if that is much, it has a share of bytes, too.
@@ -31,8 +31,8 @@ LIGHT_BYTES = 5000
 """Announcements up to this size need no share of bytes: the share of changes limits them to 1 kB a second."""
 
 BYTES_BURST = 1_000_000.0
-"""Bytes told of one member at once, to each listener: those of a server whose 150 services come up one by one, the last
-ones with 10 kB each."""
+"""Bytes sent about one member at once, to each listener: those of a server whose 150 services come up one by one, the
+last ones with 10 kB each."""
 
 BYTES_PER_S = 1000.0
 """Rate after that: what a robot's control stream takes anyway, on a link that is billed."""
@@ -42,7 +42,7 @@ BYTES_PER_S = 1000.0
 class _Share:
     changes: TokenBucket
     told_bytes: float
-    """Told, and not yet paid for by time."""
+    """Sent, and not yet paid for by time."""
     at: float
 
     @classmethod
@@ -50,7 +50,7 @@ class _Share:
         return cls(TokenBucket(rate=CHANGES_PER_S, burst=CHANGES_BURST, now=now), 0.0, now)
 
     def is_spent(self, now: float) -> bool:
-        """Return whether only light changes are told of this member for a while."""
+        """Return whether only light changes of this member are sent for a while."""
         self._pass(now)
         return self.told_bytes > BYTES_BURST
 
@@ -105,7 +105,7 @@ class Restlessness:
         return size <= LIGHT_BYTES or not self.shares.of(name, now).is_spent(now)
 
     def tell(self, name: NodeName, size: int, now: float) -> None:
-        """Count this many bytes told of this member, whether or not it may."""
+        """Count this many bytes sent about this member, whether or not it may."""
         self.shares.of(name, now).tell(size, now)
 
     def forget(self, name: NodeName) -> None:

@@ -42,7 +42,7 @@ class SourceLimits:
         return len(self._buckets)
 
     def allows(self, source: Address, now: float) -> bool:
-        """Return whether this source may be answered once more."""
+        """Return whether this source may be answered again."""
         key = _key(source[0])
         bucket = self._buckets.get(key)
         if bucket is None:

@@ -447,7 +447,7 @@ class FleetEvent(_message.Message):
     """Of a departure."""
     text: _builtins.str
     seen_us: _builtins.int
-    """Of a departure: when it was heard of last, since 1970; 0: not known."""
+    """Of a departure: when it was last heard from, since 1970; 0: not known."""
     def __init__(
         self,
         *,
@@ -470,7 +470,7 @@ Global___FleetEvent: _TypeAlias = FleetEvent  # noqa: Y015
 
 @_typing.final
 class EventLogState(_message.Message):
-    """How the log of events is doing."""
+    """State of the event log."""
 
     DESCRIPTOR: _descriptor.Descriptor
 
@@ -703,7 +703,7 @@ class ExplainedPair(_message.Message):
     busiest_witness: _builtins.str
     busiest_share: _builtins.float
     penalty_us: _builtins.int
-    """The robot asks others in place of this server for so long yet, for so many answers that could not be delivered."""
+    """For so long the robot still prefers other servers to this one, because so many answers could not be delivered."""
     bad_answers: _builtins.int
     @_builtins.property
     def path(self) -> _control_pb2.Assignment: ...
@@ -902,7 +902,7 @@ class ExplainResponse(_message.Message):
     observed_miss: _builtins.float
     """Share of recent requests that missed the deadline or failed; absent without any."""
     pairs_left_out: _builtins.int
-    """Pairs that were too many to be told of."""
+    """Number of pairs left out because there were too many."""
     target_miss: _builtins.float
     """Above 0: the service goes where it is cheapest as long as it misses no more often."""
     cost_per_request: _builtins.float

@@ -223,7 +223,7 @@ class Candidates(_message.Message):
 
     @_builtins.property
     def down(self) -> _containers.RepeatedCompositeFieldContainer[_types_pb2.InterfaceLabel]:
-        """Interfaces that it would use and that carry nothing now, hence without a candidate; for the operator's eyes."""
+        """Interfaces that it would use and that carry nothing now, so without a candidate; for the operator only."""
 
     def __init__(
         self,
@@ -545,7 +545,7 @@ class Report(_message.Message):
     GOODBYES_FIELD_NUMBER: _builtins.int
     CHANGES_ONLY_FIELD_NUMBER: _builtins.int
     changes_only: _builtins.bool
-    """It tells of paths that went up or down, beside penalties and goodbyes; all else is in the next report without this."""
+    """It holds paths that went up or down, besides penalties and goodbyes; all else is in the next report without this."""
     @_builtins.property
     def latencies(self) -> _containers.RepeatedCompositeFieldContainer[Global___LatencyReport]: ...
     @_builtins.property
@@ -836,7 +836,7 @@ class PeerSet(_message.Message):
     then nothing need go.
     """
     base_version: _builtins.int
-    """0: `peers` are all. Else the version that these changes are upon: `peers` are new or different, `removed` left,
+    """0: `peers` are all. Else the version that these changes apply to: `peers` are new or different, `removed` left,
     all others are as they were.
     """
     more: _builtins.bool

@@ -31,9 +31,10 @@ class ControlPlaneStub:
     nonce; an Ack repeats the nonce with the version applied; a Nack repeats the nonce with the error and the version
     still in force; a stale nonce is ignored; versions only grow on a stream, and the first one of a stream may be any
     but the one in force, which stands for what is held already. To sidecars older than this rule they only grow over
-    restarts of the server too. The mapping is sent whole. The peers are sent whole at first, then as changes upon a version (PeerSet.base_version) to a sidecar that
-    takes those; one that does not hold that version answers with a Nack and is sent the whole set. What is refused is
-    sent again every few seconds, whole and as a new version: the cause may have passed.
+    restarts of the server too. The mapping is sent whole. The peers are sent whole at first, then as changes since a
+    version (PeerSet.base_version) to a sidecar that accepts those; one that does not hold that version answers with a
+    Nack and is sent the whole set. What is refused is sent again every few seconds, whole and as a new version: the
+    cause may have passed.
     A message of a kind that its receiver does not know is left out and counted; from a sidecar it renews the lease.
     """
 
@@ -49,9 +50,10 @@ class ControlPlaneAsyncStub(ControlPlaneStub):
     nonce; an Ack repeats the nonce with the version applied; a Nack repeats the nonce with the error and the version
     still in force; a stale nonce is ignored; versions only grow on a stream, and the first one of a stream may be any
     but the one in force, which stands for what is held already. To sidecars older than this rule they only grow over
-    restarts of the server too. The mapping is sent whole. The peers are sent whole at first, then as changes upon a version (PeerSet.base_version) to a sidecar that
-    takes those; one that does not hold that version answers with a Nack and is sent the whole set. What is refused is
-    sent again every few seconds, whole and as a new version: the cause may have passed.
+    restarts of the server too. The mapping is sent whole. The peers are sent whole at first, then as changes since a
+    version (PeerSet.base_version) to a sidecar that accepts those; one that does not hold that version answers with a
+    Nack and is sent the whole set. What is refused is sent again every few seconds, whole and as a new version: the
+    cause may have passed.
     A message of a kind that its receiver does not know is left out and counted; from a sidecar it renews the lease.
     """
 
@@ -63,9 +65,10 @@ class ControlPlaneServicer(metaclass=_abc_1.ABCMeta):
     nonce; an Ack repeats the nonce with the version applied; a Nack repeats the nonce with the error and the version
     still in force; a stale nonce is ignored; versions only grow on a stream, and the first one of a stream may be any
     but the one in force, which stands for what is held already. To sidecars older than this rule they only grow over
-    restarts of the server too. The mapping is sent whole. The peers are sent whole at first, then as changes upon a version (PeerSet.base_version) to a sidecar that
-    takes those; one that does not hold that version answers with a Nack and is sent the whole set. What is refused is
-    sent again every few seconds, whole and as a new version: the cause may have passed.
+    restarts of the server too. The mapping is sent whole. The peers are sent whole at first, then as changes since a
+    version (PeerSet.base_version) to a sidecar that accepts those; one that does not hold that version answers with a
+    Nack and is sent the whole set. What is refused is sent again every few seconds, whole and as a new version: the
+    cause may have passed.
     A message of a kind that its receiver does not know is left out and counted; from a sidecar it renews the lease.
     """
 

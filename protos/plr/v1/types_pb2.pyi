@@ -294,7 +294,9 @@ class Peer(_message.Message):
     """Grows with every start of the sidecar."""
     draining: _builtins.bool
     credential: _builtins.bytes
-    """What this run says of itself, signed by itself (protos/trust/credential.py); opaque to the control plane, which relays it."""
+    """What this run says of itself, signed by itself (protos/trust/credential.py); opaque to the control plane, which
+    relays it.
+    """
     may_call_everything: _builtins.bool
     """No policy is in force: it may call everything."""
     candidates_serial: _builtins.int
@@ -306,7 +308,7 @@ class Peer(_message.Message):
     def offers(self) -> _containers.RepeatedCompositeFieldContainer[Global___ServiceOffer]: ...
     @_builtins.property
     def may_call(self) -> _containers.RepeatedScalarFieldContainer[_builtins.str]:
-        """Told of robots to clouds: services that the robot may call on the cloud that this is sent to, of those that the
+        """Sent to clouds about robots: services that the robot may call on the cloud that this is sent to, of those that the
         cloud offers or offered. Requests for others are refused there.
         """
 

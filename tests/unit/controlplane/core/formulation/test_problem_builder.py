@@ -127,7 +127,7 @@ def test_a_changed_path_brings_its_news_at_once_unless_many_changed(robots: int)
         told = Report((latency("wwan0", "b", histogram(0.01, times=50)),), ONE_DOWN)
         fleet.estimator.merge(name, told, fleet.now)
         fleet.drawing.reported(name, told)
-        fleet.drawing.robot_changed(name, anew=False)
+        fleet.drawing.robot_changed(name, estimate_again=False)
     fleet.draw(routine=False)
     assert all(block.epsilon[0][0] is None for block in fleet.blocks().values()), "the path is down for all"
     at_once = [block.epsilon[1][1] != before[name].epsilon[1][1] for name, block in fleet.blocks().items()]
