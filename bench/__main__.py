@@ -1,19 +1,19 @@
 """Measurements of the system, each beside its anchor from the same run.
 
 examples:
-  make bench-dataplane                                     the data plane against its targets, with a page of plots
+  make bench-dataplane                                       compares the data plane with its targets; a page of plots
   make bench-dataplane BENCH_ARGS='--quick --only one_way'
-  make bench-churn BENCH_ARGS='--minutes 3'                interfaces, servers, sidecars come and go under load
-  make bench-insiders BENCH_ARGS='--minutes 2'              a robot and a cloud of the fleet attack the others
-  make bench-control BENCH_ARGS='--size 500'                a fleet's control streams at one control plane
-  python -m bench alerts                                   what a real Alertmanager says when one server of five dies
-  make bench-fleet-day BENCH_ARGS='--members 100 --hours 6'  does anything drift or grow in a day?
-  make bench-quick                                         15 s of a drive with every contender
+  make bench-churn BENCH_ARGS='--minutes 3'                  interfaces, servers and sidecars come and go under load
+  make bench-insiders BENCH_ARGS='--minutes 2'               a robot and a cloud of the fleet attack the others
+  make bench-control BENCH_ARGS='--size 500'                 a fleet's control streams at one control plane
+  python -m bench alerts                                     what a real Alertmanager says when one server of five dies
+  make bench-fleet-day BENCH_ARGS='--members 100 --hours 6'  shows whether anything drifts or grows in a day
+  make bench-quick                                           15 s of a drive with every contender
   python -m bench evaluate --scenario 'drive-*' --contender plr-replicate
-  python -m bench report --out bench/results               makes verdicts, page and summary again from the records
-  python -m bench report --out DIR --again DIR2 --publish  compares two evaluations; writes the figures into the docs
-  python -m bench scenarios --traces ~/traces              what the evaluation replays
-  make bench-matcher BENCH_ARGS='--traces ~/traces'        are the matcher's predictions true?
+  python -m bench report --out bench/results                 makes verdicts, page and summary again from the records
+  python -m bench report --out DIR --again DIR2 --publish    compares two evaluations; writes the figures into the docs
+  python -m bench scenarios --traces ~/traces                shows what the evaluation replays
+  make bench-matcher BENCH_ARGS='--traces ~/traces'          shows whether the matcher's predictions are true
 """
 
 from __future__ import annotations
@@ -39,22 +39,32 @@ def main() -> int:
         prog="python -m bench", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     commands = parser.add_subparsers(dest="command", metavar="MEASUREMENT")
-    dataplane.add_arguments(commands.add_parser("dataplane", help="the data plane against its targets"))
-    churn.add_arguments(commands.add_parser("churn", help="minutes of trouble: requests lost or doubled, memory grown"))
+    dataplane.add_arguments(commands.add_parser("dataplane", help="compare the data plane with its targets"))
+    churn.add_arguments(
+        commands.add_parser("churn", help="cause minutes of trouble; count requests lost or doubled, and memory grown")
+    )
     insiders.add_arguments(
-        commands.add_parser("insiders", help="two members attack all the others in every way at once")
+        commands.add_parser("insiders", help="let two members attack all the others in every way at once")
     )
     control.add_arguments(
-        commands.add_parser("control", help="the control plane with 500 to 4,000 sidecars: starts, load, a dead server")
+        commands.add_parser(
+            "control", help="measure the control plane with 500 to 4,000 sidecars: starts, load, a dead server"
+        )
     )
-    alerts.add_arguments(commands.add_parser("alerts", help="what a real Alertmanager says when a server dies"))
+    alerts.add_arguments(commands.add_parser("alerts", help="show what a real Alertmanager says when a server dies"))
     fleet_day.add_arguments(
-        commands.add_parser("fleet-day", help="24 simulated hours of a fleet of 1,000: nothing drifts, nothing grows")
+        commands.add_parser("fleet-day", help="simulate 24 hours of a fleet of 1,000: nothing drifts, nothing grows")
     )
-    matcher.add_arguments(commands.add_parser("matcher", help="predicted against observed misses, on recorded traces"))
-    scenarios.add_arguments(commands.add_parser("scenarios", help="what is replayed; the generator beside traces"))
-    evaluate.add_arguments(commands.add_parser("evaluate", help="the system beside others on replayed networks"))
-    report.add_arguments(commands.add_parser("report", help="what the records of the evaluation say, without a run"))
+    matcher.add_arguments(
+        commands.add_parser("matcher", help="compare predicted with observed misses, on recorded traces")
+    )
+    scenarios.add_arguments(
+        commands.add_parser("scenarios", help="show what is replayed, and the generator beside traces")
+    )
+    evaluate.add_arguments(commands.add_parser("evaluate", help="compare the system with others on replayed networks"))
+    report.add_arguments(
+        commands.add_parser("report", help="make the reports from the records of the evaluation, without a run")
+    )
     given = (
         [sys.argv[1:]]
         if sys.argv[1:]

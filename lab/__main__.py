@@ -69,34 +69,36 @@ def main(argv: Sequence[str] | None = None) -> int:
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="python -m lab",
-        description="A network laboratory out of namespaces: robot, NAT routers, emulated links, clouds.",
+        description="A network laboratory made of namespaces: robot, NAT routers, emulated links, clouds.",
         epilog=_EXAMPLES,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument("--interfaces", default="wlan0,wwan0", metavar="A,B", help="the robot's (%(default)s)")
-    parser.add_argument("--clouds", type=int, default=2, metavar="N", help="cloud hosts (%(default)s)")
-    parser.add_argument("--robots", type=int, default=1, metavar="N", help="robots (%(default)s)")
-    parser.add_argument("--seed", type=int, default=1, metavar="N", help="of loss and jitter (%(default)s)")
     parser.add_argument(
-        "--link", action="append", default=[], metavar="IF:K=V,..", help="a link's first state; repeatable"
+        "--interfaces", default="wlan0,wwan0", metavar="A,B", help="interfaces of the robot (%(default)s)"
+    )
+    parser.add_argument("--clouds", type=int, default=2, metavar="N", help="number of cloud hosts (%(default)s)")
+    parser.add_argument("--robots", type=int, default=1, metavar="N", help="number of robots (%(default)s)")
+    parser.add_argument("--seed", type=int, default=1, metavar="N", help="seed of loss and jitter (%(default)s)")
+    parser.add_argument(
+        "--link", action="append", default=[], metavar="IF:K=V,..", help="initial state of a link; repeatable"
     )
     parser.add_argument("--trace", metavar="FILE", help="replay this trace (CSV, may be gzipped)")
     parser.add_argument(
         "--paths",
         default="wlan0=a,wwan0=b",
         metavar="IF=P,..",
-        help="its path for each interface (%(default)s)",
+        help="path of the trace for each interface (%(default)s)",
     )
     parser.add_argument("--repeat", action="store_true", help="repeat the trace from its start")
     actions = parser.add_subparsers(dest="action", metavar="up | shell | exec | calibrate")
-    up = actions.add_parser("up", help="draw it, show live statistics, take commands from stdin (default)")
+    up = actions.add_parser("up", help="draw the lab, show live statistics, take commands from stdin (default)")
     up.add_argument("--every", type=float, default=2.0, metavar="S", help="seconds between statistics")
-    shell = actions.add_parser("shell", help="a shell on a host")
+    shell = actions.add_parser("shell", help="open a shell on a host")
     shell.add_argument("host")
-    execute = actions.add_parser("exec", help="one program on a host")
+    execute = actions.add_parser("exec", help="run one program on a host")
     execute.add_argument("host")
     execute.add_argument("command", nargs=argparse.REMAINDER, metavar="-- CMD ...")
-    actions.add_parser("calibrate", help="packets per second and added delay of the emulator on this machine")
+    actions.add_parser("calibrate", help="measure packets per second and added delay of the emulator on this machine")
     return parser
 
 

@@ -87,19 +87,23 @@ def main() -> int:
     serve = commands.add_parser("serve")
     service_server.add_arguments(serve)
     serve.add_argument("--service", default=SERVICE, metavar="NAME", help="serve it under this name (%(default)s)")
-    serve.add_argument("--burden", type=Path, metavar="FILE", help="be as many ms slower as this file says")
+    serve.add_argument(
+        "--burden", type=Path, metavar="FILE", help="answer later by the milliseconds that this file holds"
+    )
     call = commands.add_parser("call")
     robot_client.add_arguments(call, rate_hz=50.0, deadline_ms=500.0)
     call.add_argument("--size", type=int, default=1000)
-    call.add_argument("--ask-delay-ms", type=float, default=0.0, help="how long the server shall take")
-    call.add_argument("--service", default=SERVICE, metavar="NAME", help="call the one of this name (%(default)s)")
+    call.add_argument(
+        "--ask-delay-ms", type=float, default=0.0, help="milliseconds that the server takes for each request"
+    )
+    call.add_argument("--service", default=SERVICE, metavar="NAME", help="call the service of this name (%(default)s)")
     call.add_argument(
         "--answer-bytes",
         type=int,
         nargs=2,
         default=(0, 0),
         metavar=("LEAST", "MOST"),
-        help="how much the server shall answer besides (default none)",
+        help="additional bytes of each answer (default none)",
     )
     options = parser.parse_args()
     if options.command == "serve":

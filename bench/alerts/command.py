@@ -38,14 +38,14 @@ LOOK_EVERY_S = 0.05
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options of `python -m bench alerts`."""
-    parser.add_argument("--robots", type=int, default=50, metavar="N", help="robots (default %(default)s)")
-    parser.add_argument("--servers", type=int, default=5, metavar="N", help="servers, 4 at least (default %(default)s)")
-    parser.add_argument("--interfaces", type=int, default=2, metavar="N", help="of a robot (default %(default)s)")
+    parser.add_argument("--robots", type=int, default=50, metavar="N", help="number of robots (default %(default)s)")
+    parser.add_argument("--servers", type=int, default=5, metavar="N", help="servers, at least 4 (default %(default)s)")
+    parser.add_argument("--interfaces", type=int, default=2, metavar="N", help="of each robot (default %(default)s)")
     parser.add_argument("--scrape-s", type=float, default=1.0, help="scrape interval (default %(default)s)")
     parser.add_argument(
-        "--pace", type=float, default=10.0, help="by how much alerts wait shorter than as shipped (default %(default)s)"
+        "--pace", type=float, default=10.0, help="divide the waits of the shipped alerts by this (default %(default)s)"
     )
-    parser.add_argument("--series-only", action="store_true", help="count series and time scrapes; let nobody die")
+    parser.add_argument("--series-only", action="store_true", help="count series and time scrapes, but stop nothing")
     parser.add_argument("--keep-logs", type=Path, metavar="DIR", help="keep configurations and logs here")
 
 

@@ -46,9 +46,9 @@ PATIENCE_S = 300.0
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options of `python -m bench control`."""
     parser.add_argument(
-        "--size", type=int, action="append", metavar="N", help=f"sidecars (repeatable; default {SIZES})"
+        "--size", type=int, action="append", metavar="N", help=f"number of sidecars (repeatable; default {SIZES})"
     )
-    parser.add_argument("--steady-s", type=float, default=30.0, help="steady time measured (default %(default)s)")
+    parser.add_argument("--steady-s", type=float, default=30.0, help="seconds of steady load (default %(default)s)")
     parser.add_argument(
         "--out", type=Path, default=Path("bench/results"), help="folder for control.json (default %(default)s)"
     )

@@ -33,7 +33,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options of `python -m bench dataplane`."""
     names = [section.name for section in SECTIONS]
     parser.add_argument("--only", action="append", choices=names, help="measure this section only; may be repeated")
-    parser.add_argument("--quick", action="store_true", help="few requests, one repeat: does it work, not how fast")
+    parser.add_argument(
+        "--quick", action="store_true", help="few requests and one repeat: shows that it works, not how fast"
+    )
     parser.add_argument("--repeats", type=int, help=f"repeats whose median counts (default {DEFAULT_REPEATS})")
     parser.add_argument(
         "--out", type=Path, default=Path("bench/results"), help="folder for the reports (default %(default)s)"

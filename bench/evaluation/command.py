@@ -40,16 +40,18 @@ USUAL = (*COMPUTED, *(name for name, contender in CONTENDERS.items() if not cont
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options of `python -m bench evaluate`."""
     names = (*CONTENDERS, *COMPUTED)
-    parser.add_argument("--scenario", action="append", metavar="GLOB", help="these only; `python -m bench scenarios`")
+    parser.add_argument(
+        "--scenario", action="append", metavar="GLOB", help="run only these; `python -m bench scenarios` lists them"
+    )
     parser.add_argument(
         "--contender",
         action="append",
         choices=names,
-        help="this one; may be repeated (default: all but plr-1x1 and the like, and those with a budget)",
+        help="run only this one; may be repeated (default: all but plr-1x1 and the like, and those with a budget)",
     )
-    parser.add_argument("--traces", type=Path, help="folder of recorded traces; default: made-up scenarios alone")
-    parser.add_argument("--seconds", type=float, help="shorten every window to so much")
-    parser.add_argument("--quick", action="store_true", help=f"{QUICK_SECONDS:g} s of {QUICK_SCENARIO}: does it work?")
+    parser.add_argument("--traces", type=Path, help="folder of recorded traces; default: only made-up scenarios")
+    parser.add_argument("--seconds", type=float, help="shorten every window to this many seconds")
+    parser.add_argument("--quick", action="store_true", help=f"run {QUICK_SECONDS:g} s of {QUICK_SCENARIO}")
     parser.add_argument(
         "--out", type=Path, default=Path("bench/results"), help="folder for the reports (default %(default)s)"
     )
@@ -58,13 +60,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         type=_count,
         default=1,
         metavar="N",
-        help="so many runs at once, each in a lab of its own; one takes less than half a core (default %(default)s)",
+        help="runs at once, each in a lab of its own; one takes less than half a core (default %(default)s)",
     )
     parser.add_argument(
-        "--resume", action="store_true", help="leave out what has a record in the folder already that is not void"
+        "--resume", action="store_true", help="skip runs that already have a valid record in the folder"
     )
     parser.add_argument(
-        "--no-report", action="store_true", help="leave records only; `python -m bench report` makes the reports later"
+        "--no-report", action="store_true", help="write only records; `python -m bench report` makes the reports later"
     )
     parser.add_argument("--keep-logs", type=Path, metavar="DIR", help="keep configurations and logs here")
 

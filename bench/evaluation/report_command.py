@@ -39,14 +39,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--again",
         type=Path,
         metavar="DIR|FILE",
-        help="another evaluation of the same windows, a folder with its records or its evaluation.json (such as "
-        f"{publish.RESULTS / DATA}): how far do the ratios differ?",
+        help="compare the ratios with another evaluation of the same windows: a folder with its records, or its "
+        f"evaluation.json (such as {publish.RESULTS / DATA})",
     )
     parser.add_argument(
         "--traces",
         type=Path,
         metavar="FOLDER",
-        help="the recorded traces that were replayed: which windows are one drive? (default: as the last report says)",
+        help="the recorded traces that were replayed, to find windows of one drive (default: as in the last report)",
     )
     parser.add_argument(
         "--publish",
@@ -54,7 +54,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         nargs="?",
         const=Path(),
         metavar="CHECKOUT",
-        help=f"write the figures into a checkout's README.md and docs as well, data and summary into {publish.RESULTS} "
+        help=f"also write the figures into a checkout's README.md and docs, data and summary into {publish.RESULTS} "
         "(default: the working directory's)",
     )
 

@@ -30,7 +30,7 @@ RECORDED = {"drive": "drive-att-vz", "satellite": "drive-att-mob", "indoor": "wa
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options of `python -m bench scenarios`."""
-    parser.add_argument("--traces", type=Path, help="folder of recorded traces; default: made-up scenarios alone")
+    parser.add_argument("--traces", type=Path, help="folder of recorded traces; default: only made-up scenarios")
 
 
 def run(options: argparse.Namespace) -> int:

@@ -24,9 +24,9 @@ SHOWN_TABLES = 40
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options of `python -m bench fleet-day`."""
     whole = Scale()
-    parser.add_argument("--members", type=int, default=whole.members, help="sidecars (default %(default)s)")
+    parser.add_argument("--members", type=int, default=whole.members, help="number of sidecars (default %(default)s)")
     parser.add_argument("--hours", type=float, default=whole.hours, help="simulated hours (default %(default)s)")
-    parser.add_argument("--seed", type=int, default=1, help="what happens is drawn from it (default %(default)s)")
+    parser.add_argument("--seed", type=int, default=1, help="seed of everything that happens (default %(default)s)")
     parser.add_argument("--trace-memory", action="store_true", help="count all memory by tracemalloc; slow")
     parser.add_argument(
         "--out", type=Path, default=Path("bench/results"), help="folder for fleet-day.json (default %(default)s)"

@@ -42,13 +42,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options of `python -m bench insiders`."""
     parser.add_argument("--minutes", type=float, default=10.0, help="length of the attack (default %(default)s)")
     parser.add_argument(
-        "--quiet-minutes", type=float, default=2.0, help="undisturbed before, and after (default %(default)s each)"
+        "--quiet-minutes", type=float, default=2.0, help="undisturbed time before and after (default %(default)s each)"
     )
     parser.add_argument(
         "--only",
         action="append",
         metavar="PATTERN",
-        help="only attacks of such names (repeatable)",
+        help="run only attacks whose name matches (repeatable)",
     )
     parser.add_argument("--seed", type=int, default=1, help="seed of the links (default %(default)s)")
     parser.add_argument(

@@ -31,7 +31,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--traces", type=Path, help="folder with index.json and NAME.csv.gz (see docs/develop/benchmarks.md)"
     )
     parser.add_argument("--quick", action="store_true", help="one trace of each family, no fleet of thousands")
-    parser.add_argument("--only", choices=PARTS, help="this part alone")
+    parser.add_argument("--only", choices=PARTS, help="run only this part")
     parser.add_argument(
         "--out", type=Path, default=Path("bench/results"), help="folder for the reports (default %(default)s)"
     )

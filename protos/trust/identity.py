@@ -243,7 +243,7 @@ def _authority(certificate: x509.Certificate) -> _Authority:
     extensions = certificate.extensions
     key = certificate.public_key()
     if not extensions.get_extension_for_class(x509.BasicConstraints).value.ca:
-        raise CertificateError(MALFORMED, "the CA's certificate is not one of a CA")
+        raise CertificateError(MALFORMED, "the CA's certificate is not a CA certificate")
     usage = extensions.get_extension_for_class(x509.KeyUsage).value
     if not (usage.key_cert_sign and usage.crl_sign):
         raise CertificateError(MALFORMED, "the CA's key may not sign certificates and revocation lists")
@@ -303,7 +303,7 @@ def _check_leaf(certificate: x509.Certificate) -> None:
     if any(extension.critical and not isinstance(extension.value, known) for extension in extensions):
         raise CertificateError(MALFORMED, "the certificate has a critical extension of unknown meaning")
     if extensions.get_extension_for_class(x509.BasicConstraints).value.ca:
-        raise CertificateError(MALFORMED, "the certificate is one of a CA, not of a node")
+        raise CertificateError(MALFORMED, "the certificate is a CA certificate, not a node's")
     usage = extensions.get_extension_for_class(x509.KeyUsage).value
     if not usage.digital_signature or usage.key_cert_sign or usage.crl_sign:
         raise CertificateError(MALFORMED, "the certificate's key usage is not a node's")
