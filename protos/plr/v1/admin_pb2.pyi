@@ -61,7 +61,7 @@ class _DepartureReasonEnumTypeWrapper(_enum_type_wrapper._EnumTypeWrapper[_Depar
     DEPARTURE_REASON_LEFT: _DepartureReason.ValueType  # 5
     """It said goodbye, and fell silent before it had finished."""
     DEPARTURE_REASON_POLICY: _DepartureReason.ValueType  # 6
-    """It is connected, but the access policy leaves it nobody to talk to."""
+    """It is connected, but the access policy lets it talk to nobody."""
 
 class DepartureReason(_DepartureReason, metaclass=_DepartureReasonEnumTypeWrapper):
     """Why a sidecar is gone."""
@@ -76,7 +76,7 @@ DEPARTURE_REASON_DRAINED: DepartureReason.ValueType  # 4
 DEPARTURE_REASON_LEFT: DepartureReason.ValueType  # 5
 """It said goodbye, and fell silent before it had finished."""
 DEPARTURE_REASON_POLICY: DepartureReason.ValueType  # 6
-"""It is connected, but the access policy leaves it nobody to talk to."""
+"""It is connected, but the access policy lets it talk to nobody."""
 Global___DepartureReason: _TypeAlias = DepartureReason  # noqa: Y015
 
 class _EventKind:
@@ -703,7 +703,7 @@ class ExplainedPair(_message.Message):
     busiest_witness: _builtins.str
     busiest_share: _builtins.float
     penalty_us: _builtins.int
-    """For so long the robot still prefers other servers to this one, because so many answers could not be delivered."""
+    """How long the robot still prefers other servers to this one, and how many undelivered answers are the reason."""
     bad_answers: _builtins.int
     @_builtins.property
     def path(self) -> _control_pb2.Assignment: ...
@@ -910,7 +910,7 @@ class ExplainResponse(_message.Message):
     predicted_miss: _builtins.float
     """What is predicted now; `mapping` has what was predicted when it was sent. Absent if nothing is planned."""
     gone_us: _builtins.int
-    """Present if the robot is gone: how long ago it went, and why. All else is as of then."""
+    """Present if the robot is gone: how long ago it went, and why. Everything else is as of then."""
     gone_reason: Global___DepartureReason.ValueType
     @_builtins.property
     def mapping(self) -> _control_pb2.ServiceMapping:

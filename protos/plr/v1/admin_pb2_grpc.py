@@ -69,7 +69,7 @@ class AdminServicer:
         raise NotImplementedError('Method not implemented!')
 
     def StreamStatus(self, request, context):
-        """The same in parts: what is repeated is to be put together, all else is in one of them.
+        """The same in parts: repeated fields have to be joined, everything else is in one of them.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')

@@ -36,7 +36,7 @@ class AdminStub:
     GetStatus: _grpc.UnaryUnaryMultiCallable[_admin_pb2.GetStatusRequest, _admin_pb2.GetStatusResponse]
     """In one message, which may be longer than gRPC's default of 4 MiB; RESOURCE_EXHAUSTED if it were longer than 16 MiB."""
     StreamStatus: _grpc.UnaryStreamMultiCallable[_admin_pb2.StreamStatusRequest, _admin_pb2.GetStatusResponse]
-    """The same in parts: what is repeated is to be put together, all else is in one of them."""
+    """The same in parts: repeated fields have to be joined, everything else is in one of them."""
     Explain: _grpc.UnaryUnaryMultiCallable[_admin_pb2.ExplainRequest, _admin_pb2.ExplainResponse]
     """Why a robot's requests for a service go where they go. NOT_FOUND, with the nearest name, if there is no such robot
     or it carries no such service.
@@ -52,7 +52,7 @@ class AdminAsyncStub(AdminStub):
     GetStatus: _aio.UnaryUnaryMultiCallable[_admin_pb2.GetStatusRequest, _admin_pb2.GetStatusResponse]  # type: ignore[assignment]
     """In one message, which may be longer than gRPC's default of 4 MiB; RESOURCE_EXHAUSTED if it were longer than 16 MiB."""
     StreamStatus: _aio.UnaryStreamMultiCallable[_admin_pb2.StreamStatusRequest, _admin_pb2.GetStatusResponse]  # type: ignore[assignment]
-    """The same in parts: what is repeated is to be put together, all else is in one of them."""
+    """The same in parts: repeated fields have to be joined, everything else is in one of them."""
     Explain: _aio.UnaryUnaryMultiCallable[_admin_pb2.ExplainRequest, _admin_pb2.ExplainResponse]  # type: ignore[assignment]
     """Why a robot's requests for a service go where they go. NOT_FOUND, with the nearest name, if there is no such robot
     or it carries no such service.
@@ -77,7 +77,7 @@ class AdminServicer(metaclass=_abc_1.ABCMeta):
         request: _admin_pb2.StreamStatusRequest,
         context: _ServicerContext,
     ) -> _typing.Union[_abc.Iterator[_admin_pb2.GetStatusResponse], _abc.AsyncIterator[_admin_pb2.GetStatusResponse]]:
-        """The same in parts: what is repeated is to be put together, all else is in one of them."""
+        """The same in parts: repeated fields have to be joined, everything else is in one of them."""
 
     @_abc_1.abstractmethod
     def Explain(

@@ -49,7 +49,7 @@ class _RemovalReasonEnumTypeWrapper(_enum_type_wrapper._EnumTypeWrapper[_Removal
     REMOVAL_REASON_LEFT: _RemovalReason.ValueType  # 2
     """It said goodbye."""
     REMOVAL_REASON_REVOKED: _RemovalReason.ValueType  # 3
-    """It must not be talked to any more."""
+    """It must no longer be talked to."""
     REMOVAL_REASON_FORBIDDEN: _RemovalReason.ValueType  # 4
     """It is there, but the access policy leaves the two nothing to do with each other."""
     REMOVAL_REASON_EXPIRED: _RemovalReason.ValueType  # 5
@@ -63,7 +63,7 @@ REMOVAL_REASON_LEASE_EXPIRED: RemovalReason.ValueType  # 1
 REMOVAL_REASON_LEFT: RemovalReason.ValueType  # 2
 """It said goodbye."""
 REMOVAL_REASON_REVOKED: RemovalReason.ValueType  # 3
-"""It must not be talked to any more."""
+"""It must no longer be talked to."""
 REMOVAL_REASON_FORBIDDEN: RemovalReason.ValueType  # 4
 """It is there, but the access policy leaves the two nothing to do with each other."""
 REMOVAL_REASON_EXPIRED: RemovalReason.ValueType  # 5
@@ -545,7 +545,7 @@ class Report(_message.Message):
     GOODBYES_FIELD_NUMBER: _builtins.int
     CHANGES_ONLY_FIELD_NUMBER: _builtins.int
     changes_only: _builtins.bool
-    """It holds paths that went up or down, besides penalties and goodbyes; all else is in the next report without this."""
+    """It holds paths that went up or down, besides penalties and goodbyes; the rest is in the next report without this."""
     @_builtins.property
     def latencies(self) -> _containers.RepeatedCompositeFieldContainer[Global___LatencyReport]: ...
     @_builtins.property
@@ -833,7 +833,7 @@ class PeerSet(_message.Message):
     """Fingerprint of the access policy that this set follows. When it differs from the last one that was not 0, a peer
     that is not listed goes at once, whatever its paths prove: nobody said what it may do under the new policy.
     0: not yet to be judged by it (right after a start, while peers are still coming back). 1: there is no policy;
-    then nothing need go.
+    then no peer has to go.
     """
     base_version: _builtins.int
     """0: `peers` are all. Else the version that these changes apply to: `peers` are new or different, `removed` left,
