@@ -78,13 +78,13 @@ class SidecarCollector(Collector):
     def collect(self) -> Iterator[Metric]:
         """Yield all metrics of the sidecar."""
         sources = self._sources
-        info = InfoMetricFamily("plr_sidecar", "What this sidecar is.")
+        info = InfoMetricFamily("plr_sidecar", "Name, role and version of this sidecar.")
         info.add_metric((), {"name": sources.name, "role": sources.role, "version": sources.version})
         yield info
         yield from _requests(sources.engine())
         yield gauge(
             "plr_interface_in_use",
-            "1 while the interface can carry something; 0: it is wanted, but not there, down or without address.",
+            "1 while the interface can carry data; 0 while it is configured, but missing, down or without an address.",
             ("interface",),
             {(name,): float(used) for name, used in sources.interfaces().items()},
         )
@@ -128,13 +128,13 @@ def _certificate(own: Identity | None, files_refused: bool) -> Iterator[Metric]:
         return
     yield gauge(
         "plr_certificate_expiry_timestamp_seconds",
-        "When the certificate in use ends, in seconds since 1970.",
+        "When the certificate in use expires, in seconds since 1970.",
         (),
         {(): own.not_after},
     )
     yield gauge(
         "plr_tls_files_refused",
-        "1 while the certificate files on the disk are not taken, and those read before stay in use.",
+        "1 while the certificate files on disk are refused, and those read before stay in use.",
         (),
         {(): float(files_refused)},
     )
@@ -147,14 +147,14 @@ def _revocations(own: RevocationState | None, stats: EngineStats) -> Iterator[Me
         yield gauge(name, text, ("ca",), by_ca)
     yield gauge(
         "plr_revocation_lists_too_old",
-        "CAs whose list is older than max_revocation_age_s, so that their nodes are not talked to.",
+        "CAs whose list is older than max_revocation_age_s, so their nodes are refused.",
         (),
         {(): len(own.too_old)},
     )
     if math.isfinite(own.max_age_s):
         yield gauge(
             "plr_revocation_list_max_age_seconds",
-            "max_revocation_age_s; not there if a list does not age.",
+            "The configured max_revocation_age_s; absent if lists may have any age.",
             (),
             {(): own.max_age_s},
         )
@@ -169,12 +169,12 @@ def _revocations(own: RevocationState | None, stats: EngineStats) -> Iterator[Me
 def _requests(stats: EngineStats) -> Iterator[Metric]:
     yield counter(
         "plr_requests",
-        "Requests of local applications by what became of them.",
+        "Requests of local applications by outcome.",
         ("service", "outcome"),
         _all_outcomes(dict(stats.requests)),
     )
     durations = HistogramMetricFamily(
-        "plr_request_duration_seconds", "From a request to its first response.", labels=("service",)
+        "plr_request_duration_seconds", "Time from a request to its first response.", labels=("service",)
     )
     for service, histogram in dict(stats.durations).items():
         buckets, total_s = cumulative(histogram)
@@ -195,37 +195,37 @@ def _requests(stats: EngineStats) -> Iterator[Metric]:
     )
     yield counter(
         "plr_copies_called_off",
-        "Copies of requests no longer awaited, since another copy was answered.",
+        "Copies of requests that are no longer awaited, because another copy was answered.",
         ("interface", "peer", "service"),
         stats.called_off,
     )
     yield counter(
         "plr_copies_explored",
-        "Copies sent over paths that the mapping does not use, to learn of them.",
+        "Copies sent over paths that the mapping does not use, to measure these paths.",
         ("interface", "peer", "service"),
         stats.explored,
     )
     yield counter(
         "plr_copies_hedged",
-        "Copies sent since the answer to another one took long.",
+        "Copies sent because the answer to another copy took long.",
         ("interface", "peer", "service"),
         stats.hedged,
     )
     yield counter(
         "plr_copy_bytes",
-        "Bytes of requests sent, without headers and repairs: each request's first copy, and extra ones.",
+        "Bytes of requests sent, without headers and repair symbols, as first or extra copies.",
         ("interface", "service", "copy"),
         stats.copy_bytes,
     )
     yield counter(
         "plr_copies_refused",
-        "Extra copies not sent, since the interface's budget forbade them.",
+        "Extra copies that were not sent, because the interface's budget forbade them.",
         ("interface", "service", "limit"),
         stats.copies_refused,
     )
     yield counter(
         "plr_bad_answers",
-        "Answers that could not be delivered; their server is out of favour for a while.",
+        "Answers that could not be delivered; other servers are preferred for a while.",
         ("peer", "service"),
         stats.bad_answers,
     )
@@ -237,7 +237,7 @@ def _requests(stats: EngineStats) -> Iterator[Metric]:
     )
     yield counter(
         "plr_executions",
-        "Requests from robots by what the cloud sidecar did with them.",
+        "Requests from robots by what the cloud's sidecar did with them.",
         ("service", "result"),
         stats.executions,
     )
@@ -287,26 +287,30 @@ def _links(links: list[LinkStats]) -> Iterator[Metric]:
             path_mtu[labels] = path.max_datagram
             phase[labels] = path.key_phase
     of_path = ("interface", "peer")
-    yield counter("plr_datagrams", "UDP datagrams.", ("interface", "direction", "kind"), datagrams)
-    yield counter("plr_datagrams_dropped", "Datagrams not believed or not sendable.", ("interface", "reason"), dropped)
-    yield counter("plr_bytes", "UDP payload bytes.", ("interface", "direction"), transferred)
+    yield counter("plr_datagrams", "UDP datagrams sent and received.", ("interface", "direction", "kind"), datagrams)
+    yield counter(
+        "plr_datagrams_dropped", "Datagrams that were refused or could not be sent.", ("interface", "reason"), dropped
+    )
+    yield counter("plr_bytes", "UDP payload bytes sent and received.", ("interface", "direction"), transferred)
     yield counter(
         "plr_interface_hangs",
-        "Times that an interface's driver did not return for long.",
+        "Times that an interface's driver did not return in time.",
         ("interface",),
         by_one({link.interface: link.hangs for link in links}),
     )
     yield gauge(
-        "plr_udp_offload", "Whether the kernel cuts or joins our datagrams.", ("interface", "direction"), offload
+        "plr_udp_offload", "Whether the kernel segments or coalesces datagrams.", ("interface", "direction"), offload
     )
     yield gauge("plr_path_up", "Whether the best path to the peer is alive.", of_path, up)
     yield gauge("plr_path_rtt_seconds", "Smoothed round-trip time of the best path to the peer.", of_path, rtt)
     yield counter("plr_path_datagrams_sent", "Numbered datagrams sent over the best path.", of_path, sent)
-    yield counter("plr_path_datagrams_lost", "Those of them found lost.", of_path, lost)
-    yield counter("plr_path_spurious_losses", "Those found lost that had arrived.", of_path, late)
+    yield counter("plr_path_datagrams_lost", "Datagrams sent over the best path and declared lost.", of_path, lost)
+    yield counter("plr_path_spurious_losses", "Datagrams declared lost that had arrived.", of_path, late)
     yield counter("plr_path_bytes_sent", "UDP payload bytes sent over the best path.", of_path, path_bytes)
-    yield gauge("plr_path_mtu_bytes", "Longest datagram the best path is known to carry.", of_path, path_mtu)
-    yield gauge("plr_path_key_phase", "Changes of the keys that seal what is sent over the best path.", of_path, phase)
+    yield gauge("plr_path_mtu_bytes", "Longest datagram that the best path is known to carry.", of_path, path_mtu)
+    yield gauge(
+        "plr_path_key_phase", "Changes of the keys that seal datagrams sent over the best path.", of_path, phase
+    )
 
 
 def _control(stats: ControlStats, connected: bool, engine: EngineStats) -> Iterator[Metric]:
@@ -320,11 +324,11 @@ def _control(stats: ControlStats, connected: bool, engine: EngineStats) -> Itera
     )
     yield counter(
         "plr_acks",
-        "Pushed peers and mappings that are in force or were.",
+        "Pushed peers and mappings that were put in force.",
         ("resource",),
         {(resource.value,): stats.acks[resource] for resource in ResourceKind},
     )
-    yield gauge("plr_control_plane_connected", "Whether the control plane is within reach.", (), {(): connected})
+    yield gauge("plr_control_plane_connected", "Whether the control plane is connected.", (), {(): connected})
     yield counter("plr_control_attempts", "Attempts to reach the control plane.", (), {(): stats.attempts})
     yield counter("plr_control_streams", "Streams that the control plane accepted.", (), {(): stats.streams})
     yield counter(
@@ -335,25 +339,25 @@ def _control(stats: ControlStats, connected: bool, engine: EngineStats) -> Itera
     )
     yield counter(
         "plr_control_messages_ignored",
-        "Messages of the control plane not acted on.",
+        "Messages of the control plane that were ignored.",
         ("reason",),
         by_one(stats.ignored),
     )
     yield counter(
         "plr_control_connections",
-        "TCP connections that a control stream took, by interface.",
+        "TCP connections that control streams used, by interface.",
         ("interface",),
         by_one(stats.connections),
     )
     yield counter(
         "plr_control_connections_left",
-        "Those that were left for another way, by cause.",
+        "TCP connections of control streams that were left for another way, by cause.",
         ("cause",),
         {(cause,): stats.connections_left[cause] for cause in LEAVE_CAUSES},
     )
     yield counter(
         "plr_control_dial_dropped",
-        "What the control stream's dialer left out or turned away, by reason.",
+        "Addresses that the control stream's dialer ignored and connections that it refused, by reason.",
         ("reason",),
         {(reason,): stats.dial_drops[reason] for reason in DIAL_DROPS},
     )
@@ -388,7 +392,7 @@ def _bridge(stats: BridgeStats) -> Iterator[Metric]:
     )
     yield counter(
         "plr_fallback_requests",
-        "Requests that the network left to the fallback on this robot, by what it did for them.",
+        "Requests that were left to the fallback on this robot, by outcome.",
         ("service", "outcome"),
         stats.fallbacks,
     )
@@ -397,14 +401,16 @@ def _bridge(stats: BridgeStats) -> Iterator[Metric]:
     )
     yield gauge(
         "plr_fallback_expected_seconds",
-        "How long a service's fallback is expected to take for a request.",
+        "Expected time of a service's fallback for one request.",
         ("service",),
         by_one(stats.fallback_takes_s),
     )
-    yield counter("plr_bridge_dropped", "Events and messages the bridge dropped.", ("reason",), by_one(stats.dropped))
+    yield counter(
+        "plr_bridge_dropped", "Events and messages that the bridge dropped.", ("reason",), by_one(stats.dropped)
+    )
     yield counter("plr_bridge_errors", "Failures of rmw or the bridge.", ("where",), by_one(stats.errors))
-    yield gauge("plr_bridge_pending", "Requests between the bridge and an answer.", (), {(): stats.pending})
-    yield gauge("plr_services_carried", "Services offered here right now.", (), {(): len(stats.carried)})
+    yield gauge("plr_bridge_pending", "Requests in the bridge that wait for an answer.", (), {(): stats.pending})
+    yield gauge("plr_services_carried", "Services offered here now.", (), {(): len(stats.carried)})
     yield gauge(
         "plr_services_left_alone",
         "Services offered by live servers that a local node already serves.",
