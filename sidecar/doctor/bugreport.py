@@ -1,7 +1,7 @@
-"""plr bugreport: collect what somebody else needs to find out what is wrong here, in one tar file, without secrets.
+"""plr bugreport: collect what a helper needs to find a fault on this node, in one tar file, without secrets.
 
 examples:
-  plr bugreport                                writes plr-bugreport-NAME-TIME.tar.gz here
+  plr bugreport                                write plr-bugreport-NAME-TIME.tar.gz in this folder
   plr bugreport --output /tmp/report.tar.gz
   plr bugreport --config try/robot.yaml
 
@@ -75,7 +75,9 @@ SYSCTLS = ("net/ipv4/conf/*/rp_filter", "net/ipv4/conf/*/arp_ignore", "net/core/
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run `plr bugreport` and return its exit code."""
     parser = parser_of("plr bugreport", __doc__)
-    parser.add_argument("--output", type=Path, metavar="FILE", help="default: plr-bugreport-NAME-TIME.tar.gz here")
+    parser.add_argument(
+        "--output", type=Path, metavar="FILE", help="default: plr-bugreport-NAME-TIME.tar.gz in this folder"
+    )
     options = parser.parse_args(arguments)
     where = where_of(options)
     seen = examine(where)
@@ -87,7 +89,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except OSError as error:
         sys.stderr.write(escaped(f"plr bugreport: {output} cannot be written: {error.strerror or error}") + "\n")
         return EXIT_FAILURE
-    sys.stdout.write(escaped(f"{output}: look through it before you publish it: tar tzf {output}") + "\n")
+    sys.stdout.write(escaped(f"{output}: read it before you publish it: tar tzf {output}") + "\n")
     return EXIT_OK
 
 
@@ -142,8 +144,8 @@ def _configuration(path: Path, config: SidecarConfig | None) -> str:
     except ConfigError as error:
         return _free(f"{error}\n")
     known = [key for key in content if key in SidecarConfig.model_fields]
-    lines = [f"{key}: (left out, as the configuration is wrong)" for key in known]
-    return "\n".join([*lines, f"# {len(content) - len(known)} keys that are not known", ""])
+    lines = [f"{key}: (left out, because the configuration is invalid)" for key in known]
+    return "\n".join([*lines, f"# {len(content) - len(known)} unknown keys", ""])
 
 
 def _versions() -> str:
@@ -166,7 +168,7 @@ def _versions() -> str:
 def _output(command: tuple[str, ...]) -> str:
     program = shutil.which(command[0])
     if program is None:
-        return f"{command[0]} is not there\n"
+        return f"{command[0]} is not installed\n"
     try:
         done = subprocess.run(  # noqa: S603  (commands of ours, no shell)
             (program, *command[1:]),
@@ -220,5 +222,5 @@ def _answer(host: str, port: int, until: float) -> bytes:
                 return bytes(data)
             data += some
     if len(data) < MAX_PART_BYTES:
-        raise TimeoutError("no whole answer in time: it may be somebody else's, who has taken the port")
+        raise TimeoutError("no complete answer in time: another program may have taken the port")
     return bytes(data)

@@ -1,4 +1,4 @@
-"""plr doctor: look at this node, without the control plane, and say what is wrong and what to do.
+"""plr doctor: check this node, without the control plane, and say what is wrong and what to do.
 
 examples:
   plr doctor                                   the sidecar of /etc/plr/sidecar.yaml, as root or in the group plr
@@ -6,7 +6,7 @@ examples:
   plr doctor --json | jq '.findings[] | select(.level != "ok")'
 
 Each line is a check: ok, warn (somebody should look) or fail (something does not work), with what to do. Paths are
-pinged over the data plane. Without a running sidecar the rest is looked at.
+pinged over the data plane. If the sidecar does not run, the other checks still do.
 
 exit codes: 0 ok or warnings only, 1 a failure, 2 bad usage
 """

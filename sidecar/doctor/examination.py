@@ -163,7 +163,7 @@ def examine(where: Where, *, pinging: bool = True) -> Examination:
     if problem is not None:
         seen.findings.append(_wrong(problem))
     elif config is not None:
-        seen.findings.append(ok("configuration", f"{where.config} is right"))
+        seen.findings.append(ok("configuration", f"{where.config} is valid"))
     now_wall = time.time()
     seen.findings += _certificate_and_clock(config, seen.state, now_wall)
     seen.findings += _ros(where, config, seen.state)
@@ -185,24 +185,24 @@ def _try_config(where: Where, told: Mapping[str, Any] | None) -> tuple[SidecarCo
 
 def _wrong(problem: ConfigError) -> Finding:
     if problem.problem.endswith(os.strerror(errno.EACCES)):
-        return warn(
-            "configuration", f"{problem}: not for this user to read, so that it is not judged", "sudo plr doctor"
-        )
-    return fail("configuration", str(problem), "correct it, and try: plr-sidecar --config FILE --check-config")
+        return warn("configuration", f"{problem}: this user may not read it, so it is not checked", "sudo plr doctor")
+    return fail("configuration", str(problem), "correct it, then run: plr-sidecar --config FILE --check-config")
 
 
 def _not_running(error: LocalError, where: Where) -> Finding:
     if isinstance(error, LocalRefusedError):
         return fail("sidecar", f"not asked: {error}", "sudo plr doctor; or: usermod -aG plr $USER, and log in again")
     if isinstance(error, LocalBusyError):
-        text = f"no answer: {error}; what follows is seen without it"
+        text = f"no answer: {error}; the other checks run without it"
         return fail(
-            "sidecar", text, "try again; systemctl status plr-sidecar; who asks: sudo ss -xp | grep sidecar.sock"
+            "sidecar",
+            text,
+            "try again; see: systemctl status plr-sidecar; to see who asks: sudo ss -xp | grep sidecar.sock",
         )
     remedy = "systemctl start plr-sidecar, and see: journalctl -u plr-sidecar -n 20"
     if where.config != DEFAULT_CONFIG:
         remedy = f"plr-sidecar --config {where.config}"
-    return fail("sidecar", f"the sidecar is not running: {error}; what follows is seen without it", remedy)
+    return fail("sidecar", f"the sidecar is not running: {error}; the other checks run without it", remedy)
 
 
 def _certificate_and_clock(
@@ -216,7 +216,7 @@ def _certificate_and_clock(
             files = load_tls_files(config.tls_dir)
         except ConfigError as error:
             if used is None:
-                yield fail("certificate", str(error), "plr ca issue, or read it as root")
+                yield fail("certificate", str(error), "create it with plr ca issue, or run plr doctor as root")
             elif not _is_for_others(error):
                 broken = str(error)
     if files is not None:
@@ -297,7 +297,7 @@ def _interfaces(config: SidecarConfig | None) -> Iterator[Finding]:
     try:
         choice = choose(list_interfaces(), None if config is None else config.interfaces)
     except OSError as error:
-        yield warn("interface", f"cannot be listed: {error}", "is netlink allowed here")
+        yield warn("interface", f"cannot be listed: {error}", "check that netlink is allowed here")
         return
     yield from node_checks.interfaces(choice)
     names = [one.name for one in choice.usable if one.kind != "loopback"]
@@ -326,8 +326,8 @@ def _judged(check: Callable[[dict[str, Any]], Iterator[Finding]], state: dict[st
     try:
         return list(check(state))
     except (KeyError, TypeError, ValueError, AttributeError) as error:
-        text = f"what the sidecar tells is not understood ({type(error).__name__}: {error})"
-        return [warn("sidecar", text, "run the plr of the same version as the sidecar: plr --version")]
+        text = f"the sidecar's answer is not understood ({type(error).__name__}: {error})"
+        return [warn("sidecar", text, "use a plr of the same version as the sidecar: plr --version")]
 
 
 def _ping_all(client: LocalClient, state: dict[str, Any]) -> dict[PathKey, Pinged]:

@@ -123,7 +123,7 @@ def unit_environment(config: Path) -> UnitEnvironment:
     if not refused:
         return UnitEnvironment(environment)
     names = " ".join(sorted(refused))[:MAX_NAMES_CHARACTERS]
-    return UnitEnvironment(environment, f"{path} belongs to user {owner}, of it are not used: {names}")
+    return UnitEnvironment(environment, f"{path} belongs to user {owner}; these variables in it are not used: {names}")
 
 
 def _read_trusted(path: Path, owners: Container[int]) -> tuple[int, str]:
@@ -136,7 +136,7 @@ def _read_trusted(path: Path, owners: Container[int]) -> tuple[int, str]:
             _refuse_untrusted("it", status, owners)
             data = file.read(MAX_ENVIRONMENT_BYTES)
             if b"\0" in data:
-                raise OSError(errno.EINVAL, "there is a NUL in it, as a power cut leaves them: write it again")
+                raise OSError(errno.EINVAL, "it contains a NUL byte, as after a power cut: write it again")
             return status.st_uid, data.decode()
     finally:
         os.close(folder)
@@ -146,4 +146,4 @@ def _refuse_untrusted(what: str, status: os.stat_result, owners: Container[int])
     if status.st_uid not in owners:
         raise OSError(errno.EPERM, f"{what} belongs to user {status.st_uid}, who is not the configuration's owner")
     if status.st_mode & (stat.S_IWGRP | stat.S_IWOTH):
-        raise OSError(errno.EPERM, f"others may write {what}: chmod go-w")
+        raise OSError(errno.EPERM, f"others may write to {what}: chmod go-w")

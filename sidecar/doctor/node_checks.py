@@ -32,7 +32,7 @@ def certificate(files: TlsFiles, now_wall: float) -> Iterator[Finding]:
     else:
         lists = [one for one in files.trust.lists().values() if one is not None]
         held = ", ".join(f"number {one.number}, signed {duration(now_wall - one.signed_at)} ago" for one in lists)
-        revoked = f"not revoked by the list held ({held})" if lists else "no revocation list is held"
+        revoked = f"not revoked by the list in use ({held})" if lists else "no revocation list is in use"
         yield ok("certificate", f"{_who(identity)}, {_left(identity, now_wall)}, {revoked}")
 
 
@@ -46,22 +46,23 @@ def files_on_disk(files: TlsFiles | None, broken: str | None, used: Mapping[str,
         # Perhaps only the sidecar refuses them: they may be readable for other users than its own.
         text, _, remedy = str(refused.get("text")).partition("; ")
         if refused.get("start"):
-            yield warn("certificate", f"{text}; the sidecar goes on with what it has", remedy)
+            yield warn("certificate", f"{text}; the sidecar continues with the files that it has", remedy)
             return
         broken = str(refused.get("text"))
     if broken is not None:
         text, _, remedy = broken.partition("; ")
-        after = "the sidecar goes on with the files that it read before, and its next start fails"
+        after = "the sidecar continues with the files that it read before, and its next start fails"
         yield fail(
             "certificate",
             f"{text}; {after}",
-            remedy.removeprefix("do: ").removeprefix("see: ") or "copy what plr ca issue or plr ca renew wrote there",
+            remedy.removeprefix("do: ").removeprefix("see: ")
+            or "copy the files that plr ca issue or plr ca renew wrote to that folder",
         )
     elif files is not None and used.get("serial") not in (None, f"{files.identity.serial:x}"):
         yield warn(
             "certificate",
             f"{files.directory} holds another certificate than the one that the sidecar uses",
-            "it looks each second: try again; if it stays so, its log says why: journalctl -u plr-sidecar",
+            "the sidecar checks every second: try again; if this stays so, its log says why: journalctl -u plr-sidecar",
         )
 
 
@@ -76,7 +77,7 @@ def certificate_in_use(used: Mapping[str, Any], now_wall: float) -> Iterator[Fin
         return
     lists = used.get("revocation_lists") or ()
     held = ", ".join(f"number {one['number']}, signed {duration(now_wall - one['signed_at'])} ago" for one in lists)
-    revoked = f"not revoked by the list held ({held})" if lists else "no revocation list is held"
+    revoked = f"not revoked by the list in use ({held})" if lists else "no revocation list is in use"
     days = (used["not_after"] - now_wall) / SECONDS_PER_DAY
     yield ok("certificate", f"{used['name']}, {used['role']}, {days:.0f} days left, {revoked}")
 
@@ -93,14 +94,16 @@ def clock(now_wall: float, floor: float, state: ClockState | None) -> Iterator[F
     """Judge the host's clock by the newest time that the CA has signed (`floor`; 0: none known) and by NTP."""
     set_it = "set it: timedatectl set-ntp true, or date -s"
     if now_wall < floor - SLACK_S:
-        yield fail("clock", f"behind what the CA has signed, by {duration(floor - now_wall)} at least", set_it)
+        yield fail(
+            "clock", f"at least {duration(floor - now_wall)} behind the newest time that the CA has signed", set_it
+        )
         return
     if state is None:
-        yield ok("clock", "not before what the CA has signed; whether NTP keeps it is not known here")
+        yield ok("clock", "not behind the newest time that the CA has signed; whether NTP keeps it is unknown")
     elif not state.synchronised:
         yield warn(
             "clock",
-            "not before what the CA has signed, but nobody keeps it (the kernel calls it unsynchronised)",
+            "not behind the newest time that the CA has signed, but not synchronised, as the kernel reports",
             "run an NTP client: timedatectl set-ntp true, or apt install chrony",
         )
     else:
@@ -111,7 +114,8 @@ def ros(environment: Mapping[str, str], shell: Mapping[str, str], problem: str |
     """Judge ROS by the sidecar's `environment`; `problem` is what `plr.sidecar.ros.environment` found."""
     if problem is not None:
         remedy = (
-            "mend the environment of the unit (/etc/plr/sidecar.env) or here: docs/start/install.md, ROS on the host"
+            "correct the environment of the unit (/etc/plr/sidecar.env) or of this shell: docs/start/install.md, "
+            "ROS on the host"
         )
         yield fail("ros", problem, remedy)
     else:
@@ -119,7 +123,7 @@ def ros(environment: Mapping[str, str], shell: Mapping[str, str], problem: str |
             "ros", f"rclpy works, with {environment.get('RMW_IMPLEMENTATION') or 'rmw_fastrtps_cpp (the default)'}"
         )
     domain, here = (env.get("ROS_DOMAIN_ID") or "0" for env in (environment, shell))
-    note = "" if domain == here else f" (this shell: {here}; what is started in it does not see the sidecar)"
+    note = "" if domain == here else f" (this shell: {here}; programs started in it do not see the sidecar)"
     reach = environment.get("ROS_AUTOMATIC_DISCOVERY_RANGE") or "SUBNET"
     profile = environment.get("FASTRTPS_DEFAULT_PROFILES_FILE") or environment.get("FASTDDS_DEFAULT_PROFILES_FILE")
     if reach in ("LOCALHOST", "OFF") or (profile and reach == "SYSTEM_DEFAULT"):
@@ -128,8 +132,8 @@ def ros(environment: Mapping[str, str], shell: Mapping[str, str], problem: str |
     else:
         yield warn(
             "domain",
-            f"ROS_DOMAIN_ID {domain}{note}, discovery {reach}: ROS talks on every network, past the sidecar",
-            "set ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST, as the unit does in its way",
+            f"ROS_DOMAIN_ID {domain}{note}, discovery {reach}: ROS uses every network and bypasses the sidecar",
+            "set ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST",
         )
 
 
@@ -159,12 +163,12 @@ def interfaces(choice: InterfaceChoice) -> Iterator[Finding]:
         if not routed and one.kind != "loopback" and len(choice.usable) > 1:
             yield warn(
                 "interface",
-                f"{one.name}: no default route leaves by it, so that it reaches its own subnet only",
+                f"{one.name}: no default route uses it, so it reaches only its own subnet",
                 f"add one with a metric of its own; {SEE_ROUTES}",
             )
     cures = {
         "down": "ip link set {} up",
-        "no carrier": "look at cable, SIM, access point: nmcli device, mmcli -m any",
+        "no carrier": "check cable, SIM and access point: nmcli device, mmcli -m any",
         "no address": "DHCP: nmcli device reapply {}, or networkctl renew {}",
     }
     for skipped in choice.skipped:
@@ -172,10 +176,16 @@ def interfaces(choice: InterfaceChoice) -> Iterator[Finding]:
             cure = cures.get(skipped.reason, "see docs/operate/troubleshooting.md").replace("{}", skipped.name)
             yield warn("interface", f"{skipped.name}: {skipped.reason}; it carries nothing now", cure)
     for name in choice.missing:
-        yield warn("interface", f"{name}: configured, and not there", "plug it in, or correct `interfaces`: ip link")
+        yield warn(
+            "interface",
+            f"{name}: configured, but not present",
+            "plug it in, or correct `interfaces` (ip link lists them)",
+        )
     if not choice.usable:
         there = ", ".join(f"{skipped.name} ({skipped.reason})" for skipped in choice.skipped) or "none"
-        yield fail("interface", f"no interface can carry anything; there are: {there}", "bring one up, or name it")
+        yield fail(
+            "interface", f"no interface can carry data; present: {there}", "bring one up, or name one in `interfaces`"
+        )
 
 
 def reverse_path(filters: Mapping[str, int | None]) -> Iterator[Finding]:
@@ -184,7 +194,7 @@ def reverse_path(filters: Mapping[str, int | None]) -> Iterator[Finding]:
     if strict and len(filters) > 1:
         yield warn(
             "rp_filter",
-            f"strict on {', '.join(strict)}: answers that come over another interface than the best way back are lost",
+            f"strict on {', '.join(strict)}: answers that do not arrive over the best route back are lost",
             f"sysctl -w {' '.join(f'net.ipv4.conf.{name}.rp_filter=2' for name in ('all', *strict))}; {SEE_ROUTES}",
         )
         return

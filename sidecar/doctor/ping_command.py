@@ -1,4 +1,4 @@
-"""plr ping: how long each path to a peer takes, over the data plane: sealed datagrams, answered by the peer's sidecar.
+"""plr ping: measure the round trip of each path to a peer, with data-plane datagrams that its sidecar answers.
 
 examples:
   plr ping cloud-1                      over each path, once a second, until Ctrl-C
@@ -174,9 +174,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run `plr ping` and return its exit code."""
     parser = parser_of("plr ping", __doc__)
     parser.add_argument("peer", type=checked(node_name), metavar="PEER", help="a node's name, as plr doctor shows it")
-    parser.add_argument("-c", "--count", type=whole(1, 1_000_000), metavar="N", help="stop after so many")
+    parser.add_argument("-c", "--count", type=whole(1, 1_000_000), metavar="N", help="number of pings, then stop")
     parser.add_argument(
-        "-i", "--interval", type=number(LEAST_INTERVAL_S, 3600), default=1.0, metavar="S", help="seconds between two"
+        "-i",
+        "--interval",
+        type=number(LEAST_INTERVAL_S, 3600),
+        default=1.0,
+        metavar="S",
+        help="seconds between two pings",
     )
     parser.add_argument(
         "-s",
@@ -184,15 +189,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
         type=whole(LEAST_BYTES, MAX_DATAGRAM_BYTES),
         default=DEFAULT_BYTES,
         metavar="BYTES",
-        help="UDP payload",
+        help="bytes of UDP payload",
     )
     parser.add_argument(
-        "-I", "--interface", type=checked(_interface, "the interface"), metavar="NAME", help="over this interface only"
+        "-I", "--interface", type=checked(_interface, "the interface"), metavar="NAME", help="use this interface only"
     )
     parser.add_argument(
-        "-W", "--wait", type=number(0.1, 10), default=2.0, metavar="S", help="seconds for the last answers"
+        "-W", "--wait", type=number(0.1, 10), default=2.0, metavar="S", help="seconds to wait for the last answers"
     )
-    parser.add_argument("--json", action="store_true", help="print the statistics as JSON, and nothing else")
+    parser.add_argument("--json", action="store_true", help="print only the statistics, as JSON")
     options = parser.parse_args(arguments)
     try:
         with _connect(where_of(options)) as client:
@@ -242,7 +247,7 @@ def _ping(client: LocalClient, options: argparse.Namespace) -> int:
     for key, tally in sorted(pinger.tallies.items()):
         say(f"{pinger.name(*key)}: {tally.line()}")
     if pinger.refused:
-        say(f"{pinger.refused} requests were not taken: the sidecar was busy with others")
+        say(f"{pinger.refused} requests were refused: the sidecar was busy with others")
     if ended is not None:
         sys.stderr.write(f"plr ping: {ended}\n")
         return EXIT_NO_ANSWER

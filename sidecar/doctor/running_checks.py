@@ -68,16 +68,16 @@ def node(state: State, expected: str | None) -> Iterator[Finding]:
     if expected is not None and name != expected:
         yield fail(
             "sidecar",
-            f"who answers is {name}, and the configuration is of {expected}",
-            "name the right one: --config FILE, --socket PATH",
+            f"{name} answers, but the configuration is for {expected}",
+            "name the right sidecar: --config FILE, --socket PATH",
         )
     else:
         text = f"{name} ({told.get('role')}), version {told.get('version')}, up for {duration(told.get('up_s', 0.0))}"
         yield ok("sidecar", text)
     if told.get("insecure"):
-        yield warn("sidecar", "insecure: true: everybody is believed to be who they say", "use tls_dir: plr ca issue")
+        yield warn("sidecar", "insecure: true: nobody's identity is checked", "use tls_dir: plr ca issue")
     for refused in state.get("refused_peers") or ():
-        yield warn("peer", f"{refused['name']} is not talked to: {refused['why']}", "see docs/start/certificates.md")
+        yield warn("peer", f"{refused['name']} is refused: {refused['why']}", "see docs/start/certificates.md")
 
 
 def stun(state: State) -> Iterator[Finding]:
@@ -96,24 +96,26 @@ def stun(state: State) -> Iterator[Finding]:
                 continue
             what = f"{interface['name']}: no answer over IPv{one['family']}"
             why = one["problem"] or (
-                "asking" if one["answered_s"] is None else f"the last came {duration(one['answered_s'])} ago"
+                "asking" if one["answered_s"] is None else f"the last answer came {duration(one['answered_s'])} ago"
             )
             if answered:
-                yield ok("stun", f"{what} ({why}): harmless, as the other family is answered")
+                yield ok("stun", f"{what} ({why}): harmless, because the other family gets answers")
             else:
                 remedy = "3478/udp of the control plane, a route over this interface, rp_filter"
-                yield warn("stun", f"{what}: {why}", f"look at {remedy}: docs/operate/troubleshooting.md, STUN fails")
+                yield warn("stun", f"{what}: {why}", f"check {remedy}: docs/operate/troubleshooting.md, STUN fails")
         if interface["stun"]:
             continue
         if families := interface.get("stun_families"):
             known = " and ".join(f"IPv{family}" for family in families)
             yield warn(
                 "stun",
-                f"{interface['name']}: no STUN server is known of the family of its addresses, only of {known}",
-                "is there a NAT: name a server that has such an address, in stun.servers or the control plane's DNS",
+                f"{interface['name']}: no STUN server is known for the family of its addresses, only for {known}",
+                "if there is a NAT, name a server with such an address in stun.servers or the control plane's DNS",
             )
         else:
-            yield warn("stun", f"{interface['name']}: no STUN server is known", "is the control plane's name resolved?")
+            yield warn(
+                "stun", f"{interface['name']}: no STUN server is known", "check that the control plane's name resolves"
+            )
 
 
 def _is_fresh(one: Mapping[str, Any]) -> bool:
@@ -124,13 +126,13 @@ def _mapped(interface: Mapping[str, Any], one: Mapping[str, Any]) -> str:
     address, port = one["mapping"]
     own = interface["addresses"]
     if address in own:
-        nat = "no NAT" if port == interface["port"] else "the port is another than the socket's"
+        nat = "no NAT" if port == interface["port"] else "the port differs from the socket's"
     else:
-        nat = "a NAT that keeps the port" if port == interface["port"] else "a NAT that gives another port"
+        nat = "a NAT that keeps the port" if port == interface["port"] else "a NAT that changes the port"
         if any(":" not in addr and ip_address(addr) in SHARED_ADDRESSES for addr in own):
-            nat += ", a carrier's (100.64.0.0/10)"
+            nat += ", of a carrier (100.64.0.0/10)"
     if one["changes"]:
-        nat += f", another mapping {one['changes']} times"
+        nat += f", mapping changed {one['changes']} times"
     return (
         f"{interface['name']}: seen as {_shown(address, port)} ({nat}), "
         f"answered {duration(one['answered_s'])} ago by {_shown(*one['server'])}"
@@ -148,12 +150,12 @@ def devices(state: State) -> Iterator[Finding]:
             yield warn(
                 "interface",
                 f"{interface['name']}: its socket is bound to an address, not to the device",
-                "let the unit have CAP_NET_RAW: docs/start/install.md, More than one interface",
+                "give the unit CAP_NET_RAW: docs/start/install.md, More than one interface",
             )
         if interface.get("hangs"):
             times = interface["hangs"]
             yield warn(
-                "interface", f"{interface['name']}: its driver hung {times} times", "look at dmesg, the firmware"
+                "interface", f"{interface['name']}: its driver hung {times} times", "check dmesg and the firmware"
             )
 
 
@@ -171,14 +173,14 @@ def mtu(state: State) -> Iterator[Finding]:
         if 0 < takes.get(name, 0) < LEAST_MTU:
             yield fail(
                 "mtu",
-                f"{name}: takes {takes[name]} bytes, and larger requests need {LEAST_MTU}: they do not get through",
+                f"{name}: takes {takes[name]} bytes, but larger requests need {LEAST_MTU} and do not get through",
                 f"ip link set {name} mtu 1280 or more, if the network carries that",
             )
         elif stuck:
             yield warn(
                 "mtu",
-                f"{name}: takes {takes[name]} bytes, but to {_names(stuck)} only the least passes ({BASE_BYTES})",
-                "something drops long packets: a tunnel, or a firewall that drops fragments",
+                f"{name}: takes {takes[name]} bytes, but paths to {_names(stuck)} carry only {BASE_BYTES}",
+                "find what drops long packets: a tunnel, or a firewall that drops fragments",
             )
         elif shown:
             yield ok("mtu", f"{name}: takes {takes.get(name, '?')} bytes, paths carry {shown}")
@@ -195,29 +197,33 @@ def paths(state: State, pings: Mapping[PathKey, Pinged]) -> Iterator[Finding]:
     dark_interfaces = {name for name, ones in by_interface.items() if all(_is_down(one) for one in ones)}
     dark_peers = {name for name, ones in by_peer.items() if all(_is_down(one) for one in ones)}
     if not by_peer:
-        yield warn("path", "no peer is known", "is the control plane reached, does the policy let us: plr status")
+        yield warn(
+            "path",
+            "no peer is known",
+            "check that the control plane is reached and that the policy names peers: plr status",
+        )
         return
     if len(dark_peers) == len(by_peer) and (state.get("node") or {}).get("up_s", STARTED_S) < STARTED_S:
-        yield warn("path", "nothing is reached yet: the sidecar has just started", "look again in a moment")
+        yield warn("path", "no peer is reached yet: the sidecar has just started", "try again in a moment")
     elif len(dark_peers) == len(by_peer):
         yield fail(
             "path",
-            f"nothing is reached over {', '.join(sorted(by_interface))}: {_why(state['paths'])}",
-            "look at the interfaces above, then the peers' UDP port: docs/operate/troubleshooting.md, A path is down",
+            f"no peer is reached over {', '.join(sorted(by_interface))}: {_why(state['paths'])}",
+            "check the interfaces above, then the peers' UDP port: docs/operate/troubleshooting.md, A path is down",
         )
     else:
         for name in sorted(dark_interfaces):
             yield warn(
                 "path",
-                f"{name}: no peer is reached over it, while others are elsewhere: {_why(by_interface[name])}",
-                f"carrier or firewall: ping -I {name} CLOUD; docs/operate/troubleshooting.md, A path is down",
+                f"{name}: no peer is reached over it, but some are over others: {_why(by_interface[name])}",
+                f"check carrier and firewall: ping -I {name} CLOUD; docs/operate/troubleshooting.md, A path is down",
             )
         for name in sorted(dark_peers):
             ones = [one for one in by_peer[name] if one["interface"] not in dark_interfaces]
             yield warn(
                 "path",
-                f"{name}: not reached over {_over(ones or by_peer[name])}, while others are: {_why(by_peer[name])}",
-                f"look at {name}: is its host up, does its sidecar run, is its UDP port open",
+                f"{name}: not reached over {_over(ones or by_peer[name])}, but others are: {_why(by_peer[name])}",
+                f"check that the host of {name} is up, its sidecar runs and its UDP port is open",
             )
     told = {(path["interface"], path["peer"]) for path in state["paths"] if not _is_down(path)}
     for path in sorted(state["paths"], key=lambda one: (one["peer"], one["interface"], one["remote"])):
@@ -242,11 +248,11 @@ def gone(state: State) -> Iterator[Finding]:
             continue
         yield warn(
             "peer",
-            f"{name}: gone for {since}: {', '.join(reasons)} over {_over(ones)}; it is no peer now",
-            f"look at {name}: is its host up, does its sidecar run; plr status tells when and why it left",
+            f"{name}: gone for {since}: {', '.join(reasons)} over {_over(ones)}; it is no longer a peer",
+            f"check that the host of {name} is up and its sidecar runs; plr status shows when and why it left",
         )
     if len(left) > MAX_GONE:
-        yield ok("peer", f"{len(left) - MAX_GONE} more that were peers within the last hour")
+        yield ok("peer", f"{len(left) - MAX_GONE} more nodes were peers within the last hour")
 
 
 def _path(path: Mapping[str, Any], pinged: Pinged | None) -> Finding:
@@ -266,14 +272,14 @@ def _path(path: Mapping[str, Any], pinged: Pinged | None) -> Finding:
         text += f"; not pinged: {pinged.problem}"
     elif pinged is not None and pinged.sent > 0:
         if not pinged.rtts_s:
-            text += f"; {pinged.sent} pings: not answered"
+            text += f"; none of {pinged.sent} pings was answered"
             return warn("path", text, f"try again: plr ping {path['peer']}")
         slowest, fastest = milliseconds(max(pinged.rtts_s)), milliseconds(min(pinged.rtts_s))
         text += f"; ping {fastest} to {slowest}, {pinged.sent - len(pinged.rtts_s)} of {pinged.sent} lost"
     if path["state"] != "up":
-        return warn("path", text, f"it may be about to die: plr ping {path['peer']} -I {path['interface']}")
+        return warn("path", text, f"the path may be about to go down: plr ping {path['peer']} -I {path['interface']}")
     if lost > LOSSY and path["sent"] >= 100:
-        return warn("path", text, "a weak signal or a full queue: look at the carrier")
+        return warn("path", text, "check the carrier: the signal may be weak, or a queue full")
     return ok("path", text)
 
 
@@ -284,7 +290,7 @@ def _is_down(path: Mapping[str, Any]) -> bool:
 def _why(ones: Sequence[Mapping[str, Any]]) -> str:
     never = "never answered"
     if not any(one.get("candidates", 1) or one["address"] for one in ones):
-        never = f"{_names(ones)} told no address (plr doctor there says why)"
+        never = f"{_names(ones)} announced no address (plr doctor there says why)"
     reasons = sorted({one["reason"] for one in ones if one["reason"]}) or [never]
     known = [one["since_s"] for one in ones if one["since_s"] is not None]
     return ", ".join(reasons) + (f" for {duration(min(known))}" if known else "")
@@ -311,22 +317,22 @@ def services(state: State) -> Iterator[Finding]:
     node = state.get("node") or {}
     robot = node.get("role") == "robot"
     if robot:
-        who, remedy = "a server that this robot knows of", "compare the names: plr status"
+        who, remedy = "a server that this robot knows", "compare the names: plr status"
     else:
         who, remedy = _domain(node)
     for name in told.get("unmet") or ():
-        yield warn("service", f"{name}: configured, and not offered by {who}", remedy)
+        yield warn("service", f"{name}: configured, but not offered by {who}", remedy)
     for name in told.get("mismatched") or ():
-        text = f"{name}: served by a node of this host's ROS domain, with a QoS that does not fit"
-        yield warn("service", text, "make the server with the default QoS of services, which is reliable")
+        text = f"{name}: served by a node of this host's ROS domain, with an incompatible QoS"
+        yield warn("service", text, "create the server with the default QoS of services, which is reliable")
     for name in told.get("silent") or ():
         text = f"{name}: the process of its server ended, or shows no sign of life"
-        yield fail("service", text, "look at that process: does it hang; if so, start it again")
+        yield fail("service", text, "check whether that process hangs; if so, restart it")
     for name, servers in sorted((told.get("unreached") or {}).items()):
-        text = f"{name}: offered by {servers} servers that this robot knows of, and none of them is reached"
+        text = f"{name}: offered by {servers} servers that this robot knows, but none of them is reached"
         yield warn("service", text, "see path")
     for name, nodes in sorted((told.get("left_alone") or {}).items()):
-        text = f"{name}: served by {', '.join(nodes)} on this robot, so that it is left alone"
+        text = f"{name}: served by {', '.join(nodes)} on this robot, so the sidecar does not offer it"
         yield warn("service", text, "stop that node, or rename its service")
     carried = told.get("carried") or {}
     if carried:
@@ -354,7 +360,10 @@ def mapping(state: State, targets: Callable[[str], float | None]) -> Iterator[Fi
     if not told.get("version"):
         carried = bool((state.get("services") or {}).get("carried"))
         if carried:
-            text, advice = "none: this robot chooses by round trips", "is the control plane reached: see control"
+            text, advice = (
+                "none: this robot chooses paths by round-trip time",
+                "check that the control plane is reached: see control",
+            )
         else:
             text, advice = "none: no service is offered yet", "see service"
         yield warn("mapping", text, advice)
@@ -362,26 +371,26 @@ def mapping(state: State, targets: Callable[[str], float | None]) -> Iterator[Fi
     where = f"version {told['version']} of the control plane, in force for {duration(told.get('age_s') or 0.0)}"
     if told.get("source") == "disk":
         where = f"version {told['version']}, kept on disk by an earlier run"
-        yield warn("mapping", f"{where}: the control plane has not told a newer one", "see control below")
+        yield warn("mapping", f"{where}: the control plane has not sent a newer one", "see control below")
     else:
         yield ok("mapping", where)
     down = {(one["interface"], one["peer"]) for one in state["paths"]}
     down -= {(one["interface"], one["peer"]) for one in state["paths"] if not _is_down(one)}
     for one in state["mapped"]:
-        pairs = ", ".join(f"{pair['interface']} to {pair['server']}" for pair in one["pairs"]) or "nowhere"
+        pairs = ", ".join(f"{pair['interface']} to {pair['server']}" for pair in one["pairs"]) or "no path"
         miss = one["predicted_miss"]
-        text = f"{one['service']} goes {pairs}; predicted to miss {'unknown' if miss is None else share(miss)}"
+        text = f"{one['service']} goes over {pairs}; predicted to miss {'unknown' if miss is None else share(miss)}"
         target = targets(one["service"])
         dead = [pair for pair in one["pairs"] if (pair["interface"], pair["server"]) in down]
         if not one["pairs"]:
             yield fail("mapping", text, "no server is reached that offers it: see path above, and plr status")
         elif dead:
             names = ", ".join(f"{pair['interface']} to {pair['server']}" for pair in dead)
-            yield warn("mapping", f"{text}, and {names} is down: others are taken", "see path above")
+            yield warn("mapping", f"{text}, but {names} is down: other paths are used", "see path above")
         elif target is not None and miss is not None and miss > target:
-            yield warn("mapping", f"{text}, more than its target {share(target)}", "plr explain tells why")
+            yield warn("mapping", f"{text}, more than its target {share(target)}", "to see why: plr explain")
         elif target is None and miss is not None and miss > HOPELESS:
-            yield warn("mapping", text, "plr explain tells why")
+            yield warn("mapping", text, "to see why: plr explain")
         else:
             yield ok("mapping", text)
 
@@ -399,6 +408,6 @@ def control(state: State) -> Iterator[Finding]:
     why = told.get("last_failure") or "not connected yet"
     yield warn(
         "control",
-        f"{names} not reached for {since}: {why}; requests go on by the last mapping",
+        f"{names} not reached for {since}: {why}; requests continue with the last mapping",
         "docs/operate/troubleshooting.md, The control plane is out of reach",
     )

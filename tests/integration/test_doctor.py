@@ -152,7 +152,7 @@ def test_a_bugreport_holds_no_secret_and_the_socket_is_private(tmp_path: Path) -
         file.write("# the CA's passphrase: correct-horse-battery\n")
     program.start()
     try:
-        wait_for_log(program, "going on without it")
+        wait_for_log(program, "the sidecar continues without it")
         sock = Path(program.config["state_dir"]) / "sidecar.sock"
         assert stat.S_IMODE(sock.stat().st_mode) & stat.S_IRWXO == 0
         report = tmp_path / "report.tar.gz"
@@ -199,7 +199,7 @@ def test_broken_certificate_files_are_a_failure_while_the_sidecar_goes_on(
 
     program.start()
     try:
-        wait_for_log(program, "going on without it")
+        wait_for_log(program, "the sidecar continues without it")
         assert not is_refused()
         (tls / "ca.pem").write_bytes(b"")
         wait_for_log(program, "the next start fails")
@@ -224,8 +224,8 @@ def test_a_folder_that_is_not_there_is_a_warning_and_no_end(tmp_path: Path) -> N
     program = Program(tmp_path, local_socket=str(tmp_path / "none" / "sidecar.sock"))
     program.start()
     try:
-        wait_for_log(program, "no local socket, plr doctor sees only the configuration: No such file or directory")
-        wait_for_log(program, "going on without it")
+        wait_for_log(program, "so plr doctor sees only the configuration: No such file or directory")
+        wait_for_log(program, "the sidecar continues without it")
     finally:
         program.process.kill()
         program.process.wait()

@@ -36,8 +36,8 @@ def test_of_one_that_is_wrong_the_known_keys(tmp_path: Path) -> None:
     path.write_text(yaml.safe_dump(WRONG))
     seen = Examination([fail("configuration", "udp_port: expected a whole number, got 'hunter2'", "correct it")])
     parts = dict(bugreport.parts(seen, Where(path)))
-    assert "udp_port: (left out, as the configuration is wrong)\n" in parts["configuration.yaml"]
-    assert parts["configuration.yaml"].endswith("# 3 keys that are not known\n")
+    assert "udp_port: (left out, because the configuration is invalid)\n" in parts["configuration.yaml"]
+    assert parts["configuration.yaml"].endswith("# 3 unknown keys\n")
     assert [name for name, text in parts.items() if "hunter2" in text] == []
 
 

@@ -56,7 +56,7 @@ def tls(tmp_path: Path) -> tuple[Authority, Path]:
 def test_a_certificate_in_force(tls: tuple[Authority, Path]) -> None:
     finding = one(node_checks.certificate(load_tls_files(tls[1]), now()))
     assert finding.level is Level.OK
-    assert "robot-7, robot, 30 days left, not revoked by the list held (number 0" in finding.text
+    assert "robot-7, robot, 30 days left, not revoked by the list in use (number 0" in finding.text
 
 
 def test_one_that_ends_soon_is_warned_of_and_one_that_ended_fails(tls: tuple[Authority, Path]) -> None:
@@ -127,7 +127,7 @@ def test_the_clock(ahead_s: float, state: ClockState | None, level: Level) -> No
 def test_ros() -> None:
     assert levels(node_checks.ros(LOCALHOST, LOCALHOST, None)) == [Level.OK, Level.OK]
     assert levels(node_checks.ros({}, {}, None)) == [Level.OK, Level.WARN]
-    broken, _ = node_checks.ros(LOCALHOST, LOCALHOST, "ROS 2's rclpy is not there for python: pip install it")
+    broken, _ = node_checks.ros(LOCALHOST, LOCALHOST, "ROS 2's rclpy is missing for python: pip install it")
     assert broken.level is Level.FAIL
     assert broken.text.endswith("pip install it")
     unit = {"ROS_AUTOMATIC_DISCOVERY_RANGE": "SYSTEM_DEFAULT", "FASTRTPS_DEFAULT_PROFILES_FILE": "/etc/plr/fastdds.xml"}
@@ -202,7 +202,7 @@ def test_the_environment_of_the_unit_is_not_read_where_others_may_write(tmp_path
         path.chmod(before)
     assert unit_environment(config).variables["PYTHONPATH"] == "/evil"
     file.write_bytes(b"ROS_DOMAIN_ID=1\0\0")
-    assert "there is a NUL in it" in unit_environment(config).refused
+    assert "it contains a NUL byte" in unit_environment(config).refused
 
 
 @pytest.mark.skipif(os.geteuid() != 0, reason="giving a file away takes root")
@@ -216,5 +216,5 @@ def test_the_environment_of_another_user_runs_none_of_his_code(tmp_path: Path) -
     assert found.variables == dict(os.environ)
     os.chown(config, 65534, 65534)
     found = unit_environment(config)
-    assert found.refused.endswith("of it are not used: LD_PRELOAD PATH RMW_IMPLEMENTATION")
+    assert found.refused.endswith("these variables in it are not used: LD_PRELOAD PATH RMW_IMPLEMENTATION")
     assert found.variables == os.environ | {"ROS_DOMAIN_ID": "42"}

@@ -75,18 +75,18 @@ def test_a_healthy_node_has_nothing_but_ok() -> None:
 
 
 def test_another_sidecar_and_one_without_certificates_are_told() -> None:
-    assert "the configuration is of robot-9" in texts(running_checks.node(state(), "robot-9"), Level.FAIL)[0]
+    assert "the configuration is for robot-9" in texts(running_checks.node(state(), "robot-9"), Level.FAIL)[0]
     insecure = state(node={**state()["node"], "insecure": True})
     assert len(texts(running_checks.node(insecure, "robot-1"), Level.WARN)) == 1
     refused = state(refused_peers=[{"name": "cloud-x", "why": "it is revoked"}])
-    assert texts(running_checks.node(refused, "robot-1"), Level.WARN) == ["cloud-x is not talked to: it is revoked"]
+    assert texts(running_checks.node(refused, "robot-1"), Level.WARN) == ["cloud-x is refused: it is revoked"]
 
 
 def test_a_dark_interface_is_blamed_once() -> None:
     paths = [path("wlan0", "cloud-a"), path("wlan0", "cloud-b")]
     paths += [path("wwan0", peer, "down") for peer in ("cloud-a", "cloud-b")]
     (text,) = texts(running_checks.paths(state(paths=paths), {}), *BAD)
-    assert text.startswith("wwan0: no peer is reached over it, while others are elsewhere: silent for 10 min")
+    assert text.startswith("wwan0: no peer is reached over it, but some are over others: silent for 10 min")
 
 
 def test_a_dead_server_is_blamed_once_and_no_interface_with_it() -> None:
@@ -106,11 +106,11 @@ def test_one_path_that_is_down_is_blamed_itself() -> None:
 def test_with_nothing_reached_it_fails_but_not_just_after_the_start() -> None:
     dark = [path(name, "cloud-a", "down", reason=None, since_s=None) for name in ("wlan0", "wwan0")]
     assert texts(running_checks.paths(state(paths=dark), {}), Level.FAIL) == [
-        "nothing is reached over wlan0, wwan0: never answered"
+        "no peer is reached over wlan0, wwan0: never answered"
     ]
     nowhere = [{**one, "candidates": 0, "address": None} for one in dark]
     (text,) = texts(running_checks.paths(state(paths=nowhere), {}), Level.FAIL)
-    assert "cloud-a told no address" in text
+    assert "cloud-a announced no address" in text
     young = state(paths=dark, node={**state()["node"], "up_s": 2.0})
     assert texts(running_checks.paths(young, {}), Level.FAIL) == []
     assert len(texts(running_checks.paths(state(paths=[]), {}), Level.WARN)) == 1
@@ -122,7 +122,7 @@ def test_pings_are_shown_and_missed_ones_warned_of() -> None:
     (text,) = texts(running_checks.paths(one, {key: Pinged([0.01, 0.02], 3)}), Level.OK)
     assert text.endswith("ping 10.0 ms to 20.0 ms, 1 of 3 lost")
     (text,) = texts(running_checks.paths(one, {key: Pinged([], 3)}), Level.WARN)
-    assert text.endswith("3 pings: not answered")
+    assert text.endswith("none of 3 pings was answered")
 
 
 def test_a_lossy_or_unstable_path_is_warned_of() -> None:
@@ -137,8 +137,8 @@ def test_a_lossy_or_unstable_path_is_warned_of() -> None:
     [
         ({"mapping": ["10.0.0.2", 5000]}, "no NAT"),
         ({"mapping": ["203.0.113.7", 5000]}, "a NAT that keeps the port"),
-        ({"mapping": ["203.0.113.7", 5999]}, "a NAT that gives another port"),
-        ({"changes": 4}, "another mapping 4 times"),
+        ({"mapping": ["203.0.113.7", 5999]}, "a NAT that changes the port"),
+        ({"changes": 4}, "mapping changed 4 times"),
     ],
 )
 def test_what_stun_says_of_the_nat(of: dict[str, Any], expected: str) -> None:
@@ -151,7 +151,7 @@ def test_stun_servers_of_the_other_family_alone_are_told_from_none() -> None:
     assert "no STUN server is known;" in f"{texts(running_checks.stun(none), Level.WARN)[0]};"
     other = state(interfaces=[interface("wlan0", addresses=["fd00:1::9"], stun=[], stun_families=[4])])
     (text,) = texts(running_checks.stun(other), Level.WARN)
-    assert "no STUN server is known of the family of its addresses, only of IPv4" in text
+    assert "no STUN server is known for the family of its addresses, only for IPv4" in text
     assert "resolved" not in text
 
 
@@ -161,7 +161,7 @@ def test_stun_that_is_not_answered_is_warned_of_unless_the_other_family_is() -> 
     (text,) = texts(running_checks.stun(alone), Level.WARN)
     assert text == "wlan0: no answer over IPv4: no answer from 192.0.2.9:3478"
     old = state(interfaces=[interface("wlan0", stun=[stun(answered_s=300.0)])])
-    assert "the last came 5 min ago" in texts(running_checks.stun(old), Level.WARN)[0]
+    assert "the last answer came 5 min ago" in texts(running_checks.stun(old), Level.WARN)[0]
     both = state(interfaces=[interface("wlan0", stun=[stun(), {**silent, "family": 6}])])
     assert texts(running_checks.stun(both), *BAD) == []
     assert len(texts(running_checks.stun(state(interfaces=[interface("wlan0", stun=[])])), Level.WARN)) == 1
@@ -170,7 +170,7 @@ def test_stun_that_is_not_answered_is_warned_of_unless_the_other_family_is() -> 
 def test_a_path_that_carries_the_least_only_is_warned_of() -> None:
     stuck = state(paths=[path("wlan0", "cloud-a", max_datagram=1200)])
     (text,) = texts(running_checks.mtu(stuck), Level.WARN)
-    assert "takes 1500 bytes, but to cloud-a only the least passes" in text
+    assert "takes 1500 bytes, but paths to cloud-a carry only" in text
     searching = state(paths=[path("wlan0", "cloud-a", max_datagram=1200, since_s=5.0)])
     assert texts(running_checks.mtu(searching), *BAD) == []
 
@@ -179,7 +179,7 @@ def test_a_path_that_carries_the_least_only_is_warned_of() -> None:
 def test_an_interface_that_takes_less_than_the_least_fails() -> None:
     small = state(interfaces=[{**interface("wlan0"), "mtu": LEAST_MTU - 1}, interface("wwan0")])
     (text,) = texts(running_checks.mtu(small), Level.FAIL)
-    assert text == "wlan0: takes 1227 bytes, and larger requests need 1228: they do not get through"
+    assert text == "wlan0: takes 1227 bytes, but larger requests need 1228 and do not get through"
     enough = state(interfaces=[{**interface("wlan0"), "mtu": LEAST_MTU}, interface("wwan0")])
     assert texts(running_checks.mtu(enough), *BAD) == []
 
@@ -206,14 +206,14 @@ def test_services() -> None:
 def test_a_server_whose_qos_does_not_fit_blames_no_name() -> None:
     told = {"carried": {"/map": "nav_msgs/srv/GetMap"}, "unmet": [], "mismatched": ["/plan"]}
     (finding,) = [one for one in running_checks.services(state(services=told)) if one.level is Level.WARN]
-    assert "with a QoS that does not fit" in finding.text
+    assert "with an incompatible QoS" in finding.text
     assert "reliable" in finding.remedy
 
 
 def test_a_service_whose_servers_are_not_reached_is_not_told_as_a_wrong_name() -> None:
     told = {"carried": {"/map": "nav_msgs/srv/GetMap"}, "unmet": [], "unreached": {"/plan": 2}}
     (text,) = texts(running_checks.services(state(services=told)), Level.WARN)
-    assert text.startswith("/plan: offered by 2 servers that this robot knows of, and none of them is reached")
+    assert text.startswith("/plan: offered by 2 servers that this robot knows, but none of them is reached")
 
 
 @pytest.mark.parametrize(
@@ -229,13 +229,14 @@ def test_a_server_that_a_cloud_misses_may_be_in_another_domain(environment: obje
     node = {"name": "cloud-a", "role": "cloud", "environment": environment}
     told = {"carried": {"/map": "a/srv/B"}, "unmet": ["/plan"]}
     (found,) = [one for one in running_checks.services(state(node=node, services=told)) if one.level is Level.WARN]
-    assert found.text == f"/plan: configured, and not offered by a node of this host's {where}"
+    assert found.text == f"/plan: configured, but not offered by a node of this host's {where}"
     assert found.remedy == "compare the names (plr status), and the ROS_DOMAIN_ID that the server was started with"
 
 
 def test_the_mapping() -> None:
     none = state(mapping={"version": 0, "source": None, "age_s": None}, mapped=[])
-    assert "this robot chooses by round trips" in texts(running_checks.mapping(none, lambda _: None), Level.WARN)[0]
+    (text,) = texts(running_checks.mapping(none, lambda _: None), Level.WARN)
+    assert "this robot chooses paths by round-trip time" in text
     nothing: dict[str, object] = {"carried": {}, "unmet": [], "left_alone": {}, "missing_types": {}}
     idle = state(mapping={"version": 0, "source": None, "age_s": None}, mapped=[], services=nothing)
     assert "no service is offered yet" in texts(running_checks.mapping(idle, lambda _: None), Level.WARN)[0]
@@ -252,7 +253,7 @@ def test_a_mapping_that_leads_nowhere_fails_and_a_hopeless_one_is_warned_of() ->
     (mapped,) = state()["mapped"]
     nowhere = state(mapped=[{**mapped, "pairs": [], "predicted_miss": 1.0}])
     (text,) = texts(running_checks.mapping(nowhere, lambda _: None), Level.FAIL)
-    assert text.startswith("/plan goes nowhere")
+    assert text.startswith("/plan goes over no path")
     hopeless = state(mapped=[{**mapped, "predicted_miss": 0.97}])
     assert "predicted to miss 97 %" in texts(running_checks.mapping(hopeless, lambda _: None), Level.WARN)[0]
     assert texts(running_checks.mapping(state(), lambda _: None), *BAD) == []
@@ -267,6 +268,6 @@ def test_a_server_that_stands_still_is_named() -> None:
 
 
 def test_the_control_stream() -> None:
-    lost = {"names": ["cp:50051"], "connected": False, "since_s": 90.0, "last_failure": "nothing comes over wlan0"}
+    lost = {"names": ["cp:50051"], "connected": False, "since_s": 90.0, "last_failure": "nothing arrives over wlan0"}
     (text,) = texts(running_checks.control(state(control=lost)), Level.WARN)
-    assert text.startswith("cp:50051 not reached for 90 s: nothing comes over wlan0")
+    assert text.startswith("cp:50051 not reached for 90 s: nothing arrives over wlan0")

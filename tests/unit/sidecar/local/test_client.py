@@ -198,7 +198,7 @@ def test_pings_that_were_refused_are_not_lost(
     assert ping_command.main(["cloud-1", "-c", "4", "-i", "0.1", *at]) == 0
     shown = capsys.readouterr().out.splitlines()
     assert shown[-2].startswith("wlan0 to cloud-1: 2 sent, 2 answered, 0 % lost, 1 not sent")
-    assert shown[-1] == "1 requests were not taken: the sidecar was busy with others"
+    assert shown[-1] == "1 requests were refused: the sidecar was busy with others"
 
 
 def test_pongs_nobody_asked_for_are_not_counted(
