@@ -220,7 +220,7 @@ def decode_line(line: bytes) -> Line | None:
         first = error.errors(include_url=False, include_input=False, include_context=False)[0]
         raise DecodeError(f"{key_path(first['loc']) or 'a line'}: {first['msg']}") from None
     except (ValueError, RecursionError) as error:
-        raise DecodeError("a line is no JSON") from error
+        raise DecodeError("a line is not JSON") from error
 
 
 def _checked(part: str, value: Any) -> Any:

@@ -37,7 +37,7 @@ ACCOUNT = "plr"
 _REPEATED = frozenset({"paths", "interfaces", "mapped"})
 """Parts that come repeatedly."""
 _BUSY = "the sidecar is busy with others: try again"
-_STRANGER = "what answers at the socket is no sidecar"
+_STRANGER = "the program that answers at the socket is not a sidecar"
 _TIMEVAL = struct.Struct("ll")
 
 
@@ -69,7 +69,7 @@ class LocalClient:
         user = user_of(self._sock)
         if user not in {0, os.geteuid(), *_unit_user(), *owners}:
             self._sock.close()
-            raise LocalError(f"{path}: user {user} listens there, who is neither root nor {ACCOUNT} nor this user")
+            raise LocalError(f"{path}: user {user} listens there and is neither root nor {ACCOUNT} nor this user")
 
     def __enter__(self) -> LocalClient:
         return self
@@ -178,7 +178,7 @@ def _parse(line: bytes) -> Line | None:
 
 def _connect(path: Path) -> socket.socket:
     if b"\0" in os.fsencode(path) or len(os.fsencode(for_group(path))) > MAX_SOCKET_BYTES:
-        raise LocalError(f"{path}: no path of a socket")
+        raise LocalError(f"{path}: not a valid path of a socket")
     try:
         return _connect_at(path)
     except PermissionError:

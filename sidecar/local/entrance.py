@@ -53,7 +53,7 @@ class SocketLock:
         descriptor = os.open(self._path, flags, 0o600)
         try:
             if not stat.S_ISREG(os.fstat(descriptor).st_mode):
-                raise OSError(errno.EEXIST, f"{self._path.name} is no file")
+                raise OSError(errno.EEXIST, f"{self._path.name} is not a regular file")
             fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
             os.close(descriptor)
@@ -134,7 +134,7 @@ def _remove_stale(path: Path) -> None:
     """Remove a socket that nobody listens at: a killed run left it behind."""
     try:
         if not stat.S_ISSOCK(path.lstat().st_mode):
-            raise OSError(errno.EEXIST, "something else than a socket is there")
+            raise OSError(errno.EEXIST, "something other than a socket is there")
     except FileNotFoundError:
         return
     # The lock only shows sidecars that use it; the socket may be another program's, or an earlier version's.
@@ -153,7 +153,7 @@ def _open_to_group(path: Path, group: int | None) -> tuple[int, int]:
     try:
         status = os.fstat(descriptor)
         if not stat.S_ISSOCK(status.st_mode) or status.st_uid != os.geteuid():
-            raise OSError(errno.EPERM, "somebody else changes its folder")
+            raise OSError(errno.EPERM, "another program changes its folder")
         if group is not None:
             itself = f"/proc/self/fd/{descriptor}"
             if status.st_gid != group:

@@ -56,9 +56,9 @@ def decode_request(line: bytes) -> StateRequest | PingRequest:
     try:
         request = json.loads(line)
     except (ValueError, RecursionError):
-        raise DecodeError("a request is one line of JSON") from None
+        raise DecodeError("a request must be one line of JSON") from None
     if not isinstance(request, dict):
-        raise DecodeError("a request is an object")
+        raise DecodeError("a request must be an object")
     request_id = _whole(request, "id", 0, MAX_ID)
     match request.get("ask"):
         case "state":
@@ -67,20 +67,20 @@ def decode_request(line: bytes) -> StateRequest | PingRequest:
             return PingRequest(
                 request_id, _peer(request), _interface(request), _whole(request, "size", 0, MAX_DATAGRAM_BYTES)
             )
-    raise DecodeError("ask is state or ping")
+    raise DecodeError("ask must be state or ping")
 
 
 def _whole(request: dict[str, Any], key: str, least: int, most: int) -> int:
     value = request.get(key)
     if type(value) is not int or not least <= value <= most:
-        raise DecodeError(f"{key} is a whole number from {least} to {most}")
+        raise DecodeError(f"{key} must be a whole number from {least} to {most}")
     return value
 
 
 def _peer(request: dict[str, Any]) -> str:
     value = request.get("peer")
     if not isinstance(value, str):
-        raise DecodeError("peer is a node's name")
+        raise DecodeError("peer must be a node's name")
     return node_name(value, "peer")
 
 
@@ -89,7 +89,7 @@ def _interface(request: dict[str, Any]) -> str | None:
     if value is None:
         return None
     if not isinstance(value, str) or not 0 < len(value) <= _MAX_INTERFACE_CHARACTERS:
-        raise DecodeError("interface is an interface's name")
+        raise DecodeError("interface must be an interface's name")
     return value
 
 

@@ -220,7 +220,7 @@ class LocalServer:
                 try:
                     self._turn()
                 except Exception:
-                    log.exception("internal error; the local socket goes on")
+                    log.exception("internal error; the local socket continues")
                     time.sleep(ERROR_PAUSE_S)
         finally:
             for client in list(self._clients.values()):
@@ -277,14 +277,14 @@ class LocalServer:
     def _refusal(self, sock: socket.socket, user: int | None) -> tuple[str, str] | None:
         others = [client.user for client in self._clients.values()]
         if user is None:
-            return ("full", "too many ask at once: try again") if others.count(None) >= MAX_OWN else None
+            return ("full", "too many clients ask at once: try again") if others.count(None) >= MAX_OWN else None
         # The socket's mode demands the same; a folder opened wider, or a descriptor passed on, does not undo this.
         if self._group is None or self._group not in groups_of(sock):
             return "not_allowed", f"only root and members of the group {GROUP} may ask"
         if others.count(user) >= MAX_OF_A_USER:
-            return "user_full", "too many of this user ask at once: try again"
+            return "user_full", "too many clients of this user ask at once: try again"
         if len(others) - others.count(None) >= MAX_MEMBERS:
-            return "full", "too many ask at once: try again"
+            return "full", "too many clients ask at once: try again"
         return None
 
     def _serve(self, client: _Client, events: int) -> None:
@@ -297,7 +297,7 @@ class LocalServer:
             self._drop(client)
             return
         except Exception:
-            log.exception("internal error; a client of the local socket is let go")
+            log.exception("internal error; a client of the local socket is disconnected")
             self._drop(client)
             return
         self._follow(client)

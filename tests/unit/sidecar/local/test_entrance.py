@@ -103,7 +103,7 @@ def test_nothing_else_is_opened_to_the_group_in_its_place(
 
     monkeypatch.setattr(entrance_module, "_open_to_group", exchange)
     entrance = Entrance(path, grp.getgrnam("daemon").gr_gid)
-    with pytest.raises(OSError, match="somebody else changes its folder"):
+    with pytest.raises(OSError, match="another program changes its folder"):
         entrance.open(0.0)
     entrance.close()
     for one in (victim, path):

@@ -333,7 +333,7 @@ def test_the_socket_of_another_sidecar_and_other_files_are_left_alone(
         assert client.state()["node"]
     other = tmp_path / "file"
     other.write_text("precious")
-    with pytest.raises(LocalSocketError, match="something else"):
+    with pytest.raises(LocalSocketError, match="something other"):
         LocalServer(other, source).open()
     assert other.read_text() == "precious"
 

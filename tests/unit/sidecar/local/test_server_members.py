@@ -135,7 +135,7 @@ def test_members_who_hold_all_their_places_leave_root_its_own(server: LocalServe
         with LocalClient(server.path) as client:
             assert client.state()["node"] == {"name": "robot-1"}
         with as_user(NOBODY - 9, [GROUP.gr_gid], ASK.format(path=str(server.path), patience=0)) as late:
-            assert "LocalBusyError: too many ask at once: try again" in late.communicate(timeout=60)[1]
+            assert "LocalBusyError: too many clients ask at once: try again" in late.communicate(timeout=60)[1]
     finally:
         for user in users:
             user.kill()
@@ -162,7 +162,7 @@ def test_a_member_who_pings_without_end_leaves_root_its_pings(server: LocalServe
 def test_a_full_house_is_called_busy(server: LocalServer) -> None:
     socks = [raw(server) for _ in range(MAX_OWN)]
     wait_until(lambda: len(server._clients) == MAX_OWN)
-    with pytest.raises(LocalBusyError, match="too many ask at once: try again"), LocalClient(server.path) as client:
+    with pytest.raises(LocalBusyError, match="too many clients ask at once"), LocalClient(server.path) as client:
         client.state()
     for sock in socks:
         sock.close()
@@ -202,7 +202,7 @@ time.sleep(100)
         try:
             assert stranger.stdout is not None
             assert stranger.stdout.readline() == "ready\n"
-            with pytest.raises(LocalError, match=f"user {NOBODY} listens there, who is neither root nor plr"):
+            with pytest.raises(LocalError, match=f"user {NOBODY} listens there and is neither root nor plr"):
                 LocalClient(path / "s")
             LocalClient(path / "s", frozenset({NOBODY})).close()
         finally:
