@@ -77,7 +77,7 @@ class RosBridge:
     def start(self, data_plane: DataPlane) -> None:
         """Join the ROS domain and start the ROS thread; raise rclpy's RCLError when rmw cannot start."""
         if self._thread is not None:
-            raise RuntimeError("the bridge was started before")
+            raise RuntimeError("the bridge has already been started")
         loop = RosLoop(sidecar_node_name(self.name), self._domain_id)
         try:
             side = self._make_side(loop, data_plane)
@@ -86,7 +86,7 @@ class RosBridge:
             raise
         self._loop = loop
         self._thread = threading.Thread(target=self._run, args=(loop, side, data_plane), name="plr-ros", daemon=True)
-        log.info("in ROS domain %d as %s", loop.domain_id, loop.node.get_fully_qualified_name())
+        log.info("joined ROS domain %d as %s", loop.domain_id, loop.node.get_fully_qualified_name())
         self._thread.start()
 
     def stop(self, timeout: float = STOP_TIMEOUT_S) -> bool:
@@ -177,7 +177,7 @@ class RosBridge:
         while (event := self._events.take()) is not None:
             if isinstance(event, ExecuteRequest):
                 self.stats.refused[event.service, "draining"] += 1
-                data_plane.refuse(event.execution, RejectReason.DRAINING, "the sidecar is going away")
+                data_plane.refuse(event.execution, RejectReason.DRAINING, "the sidecar is shutting down")
 
     def _note_error(self, where: str, now: float) -> None:
         self.stats.errors[where] += 1

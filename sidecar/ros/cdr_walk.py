@@ -72,7 +72,7 @@ class Walk:
         position = -(-position // 4) * 4
         begin = position + 4
         if begin > self.end:
-            raise CdrError("cut off")
+            raise CdrError("truncated")
         self.step(1)
         found = int.from_bytes(self.data[position:begin], self.order)  # type: ignore[arg-type]  # one of the two
         if self.lengths is not None:
@@ -123,7 +123,7 @@ class Fixed:
         """Return where it ends; raises CdrError."""
         position += self.sizes[position % ALIGNMENT]
         if position > walk.end:
-            raise CdrError("cut off")
+            raise CdrError("truncated")
         return position
 
     def walk_many(self, walk: Walk, position: int, count: int) -> int:
@@ -166,7 +166,7 @@ class String:
         if size > walk.end - begin:
             raise CdrError(f"a string of {size} bytes, {walk.end - begin} left")
         if self.bound is not None and size > self.bound + 1:
-            raise CdrError(f"a string of {size} bytes, at most {self.bound} may be")
+            raise CdrError(f"a string of {size} bytes, but at most {self.bound} are allowed")
         walk.take(size + 1)
         return begin + size
 
@@ -218,7 +218,7 @@ class Elements:
         if count * self.element.least > walk.end - begin:
             raise CdrError(f"{count} elements announced, {walk.end - begin} bytes left")
         if self.bound is not None and count > self.bound:
-            raise CdrError(f"{count} elements, at most {self.bound} may be")
+            raise CdrError(f"{count} elements, but at most {self.bound} are allowed")
         if not count:
             return begin
         walk.take(count * self.element.struct_bytes)

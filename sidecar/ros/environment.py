@@ -45,15 +45,14 @@ def problem(environment: Mapping[str, str] = os.environ, *, thorough: bool = Fal
     rclpy = importlib.util.find_spec("rclpy")
     if rclpy is None:
         return (
-            f"ROS 2's rclpy is not there for {sys.executable}: with ROS from apt, source /opt/ros/jazzy/setup.bash "
-            "before (for the unit: /etc/plr/sidecar.env, deploy/README.md); without, "
-            + _without_apt(platform.machine())
+            f"ROS 2's rclpy is missing for {sys.executable}: with ROS from apt, first source /opt/ros/jazzy/setup.bash "
+            "(for the unit: /etc/plr/sidecar.env, deploy/README.md); without it, " + _without_apt(platform.machine())
         )
     folders = list(rclpy.submodule_search_locations or ())
     if importlib.machinery.PathFinder.find_spec(_C_PART, folders) is None:
         return (
             f"ROS 2's rclpy in {' '.join(folders)} was not built for {sys.executable}, which is Python "
-            f"{sys.version_info.major}.{sys.version_info.minor}: make the environment with ROS's own Python; for ROS "
+            f"{sys.version_info.major}.{sys.version_info.minor}: create the environment with ROS's own Python; for ROS "
             "from apt: /usr/bin/python3 -m venv --system-site-packages (docs/start/install.md, ROS from apt)"
         )
     rmw = environment.get("RMW_IMPLEMENTATION", "")
@@ -64,12 +63,12 @@ def problem(environment: Mapping[str, str] = os.environ, *, thorough: bool = Fal
         return None
     if rmw and rmw != DEFAULT_RMW:
         return (
-            f"RMW_IMPLEMENTATION: {rmw!r} is not installed here; unset it, which means {DEFAULT_RMW}, or install it "
+            f"RMW_IMPLEMENTATION: {rmw!r} is not installed here; unset it to use {DEFAULT_RMW}, or install it "
             "with ROS from apt: ros-jazzy-" + rmw.replace("_", "-")
         )
     if _LACKS_A_LIBRARY in said:
         said += (
-            "; with ROS from apt, source /opt/ros/jazzy/setup.bash before (for the unit: LD_LIBRARY_PATH in "
+            "; with ROS from apt, first source /opt/ros/jazzy/setup.bash (for the unit: LD_LIBRARY_PATH in "
             "/etc/plr/sidecar.env, deploy/README.md)"
         )
     return f"ROS 2 does not start here: {said}"
@@ -79,7 +78,7 @@ def _without_apt(machine: str) -> str:
     """Return what to do on a `machine` (uname's name for it) that has no ROS from apt yet."""
     if machine == "x86_64":
         return "in the checkout: pip install '.[ros]'"
-    return f"install it: no wheel of it is for {machine} (docs/start/install.md, ROS from apt)"
+    return f"install it: it has no wheel for {machine} (docs/start/install.md, ROS from apt)"
 
 
 def _try(environment: Mapping[str, str]) -> str | None:

@@ -224,7 +224,7 @@ class MessageType:
         self._last_length = 0
         self._buffer = _Bytes()
         if _holding.bytes_init(self._buffer, 0, _holding.default_allocator()) != _OK:
-            raise RclError(f"cannot make a buffer: {_take_error()}")
+            raise RclError(f"cannot create a buffer: {_take_error()}")
         self._clean_capacity = 0
         self._grow_buffer(FIRST_BUFFER_BYTES)
 
@@ -239,7 +239,7 @@ class MessageType:
         """Return an empty message."""
         pointer = self._create()
         if not pointer:
-            raise RclError(f"cannot make a {self.name}")
+            raise RclError(f"cannot create a {self.name}")
         return Message(pointer, self._destroy)
 
     def serialize(self, message: Message) -> bytes:
@@ -284,13 +284,15 @@ class MessageType:
     def _check(self, payload: bytes | memoryview) -> None:
         if self._layout is None:
             if len(payload) > MAX_UNKNOWN_BYTES:
-                many = f"{len(payload)} bytes are more than the {MAX_UNKNOWN_BYTES} that may be"
-                raise RosBridgeError(f"{many} of a {self.name}: it has fields of a kind that cannot be checked before")
+                many = f"{len(payload)} bytes, but at most {MAX_UNKNOWN_BYTES} are allowed"
+                raise RosBridgeError(
+                    f"{many} for a {self.name}: it has fields of a kind that cannot be checked in advance"
+                )
             return
         try:
             check(self._layout, payload)
         except CdrError as error:
-            raise RosBridgeError(f"the bytes are not a {self.name} that is let in: {error}") from error
+            raise RosBridgeError(f"the bytes are not a {self.name} that is accepted: {error}") from error
 
 
 def take_request(service: int, request_type: MessageType) -> tuple[RmwRequestId, bytes] | None:
@@ -344,7 +346,7 @@ def graph_guard(node: int) -> int:
     """Return the address of the guard condition that rcl triggers when the ROS graph of the rcl node changes."""
     guard = _holding.graph_guard(node)
     if not guard:
-        raise RclError(f"no guard condition of the graph: {_take_error()}")
+        raise RclError(f"cannot get the guard condition of the graph: {_take_error()}")
     return int(guard)
 
 

@@ -57,7 +57,7 @@ def test_stopped_at_once_or_never_started(mesh: Mesh) -> None:
     assert mesh.robot.stop()
     assert RosBridge(name="idle", role=Role.CLOUD, rules=()).stop()
     assert threading.active_count() == threads
-    with pytest.raises(RuntimeError, match="started before"):
+    with pytest.raises(RuntimeError, match="already been started"):
         mesh.robot.start(mesh.link.robot)
 
 

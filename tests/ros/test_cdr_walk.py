@@ -249,7 +249,7 @@ def test_images_of_any_size_cost_nothing() -> None:
         (b"\0\1", "shorter than its header"),
         (b"\0\7\0\0" + bytes(100), "not plain CDR"),
         (b"\0\3\0\0" + bytes(100), "not plain CDR"),
-        (LITTLE_ENDIAN, "cut off"),
+        (LITTLE_ENDIAN, "truncated"),
         (LITTLE_ENDIAN + bytes(8) + b"\xff\xff\xff\xff", "a string of 4294967295 bytes, 0 left"),
     ],
 )

@@ -34,7 +34,7 @@ def test_domains_that_do_not(domain: str) -> None:
 def test_an_rmw_that_is_not_installed_is_named() -> None:
     told = environment.problem({**os.environ, "RMW_IMPLEMENTATION": "rmw_nowhere_cpp"})
     assert told == (
-        "RMW_IMPLEMENTATION: 'rmw_nowhere_cpp' is not installed here; unset it, which means rmw_fastrtps_cpp, or "
+        "RMW_IMPLEMENTATION: 'rmw_nowhere_cpp' is not installed here; unset it to use rmw_fastrtps_cpp, or "
         "install it with ROS from apt: ros-jazzy-rmw-nowhere-cpp"
     )
 
@@ -49,7 +49,7 @@ def test_without_rclpy_it_says_where_to_get_it(monkeypatch: pytest.MonkeyPatch) 
     told = environment.problem()
     assert told is not None
     assert told.startswith(
-        f"ROS 2's rclpy is not there for {sys.executable}: with ROS from apt, source /opt/ros/jazzy/"
+        f"ROS 2's rclpy is missing for {sys.executable}: with ROS from apt, first source /opt/ros/jazzy/"
     )
 
 
@@ -57,8 +57,8 @@ def test_without_rclpy_it_says_where_to_get_it(monkeypatch: pytest.MonkeyPatch) 
 @pytest.mark.parametrize(
     ("machine", "told"),
     [
-        ("x86_64", "without, in the checkout: pip install '.[ros]'"),
-        ("aarch64", "without, install it: no wheel of it is for aarch64 (docs/start/install.md, ROS from apt)"),
+        ("x86_64", "without it, in the checkout: pip install '.[ros]'"),
+        ("aarch64", "without it, install it: it has no wheel for aarch64 (docs/start/install.md, ROS from apt)"),
     ],
 )
 def test_wheels_of_ros_are_offered_only_where_there_are_some(
@@ -117,6 +117,6 @@ def test_a_library_that_rclpy_does_not_find_is_named_in_one_line(tmp_path: Path,
     assert done.returncode == 2
     assert done.stderr == (
         "plr-sidecar: ROS 2 does not start here: ImportError: librcl.so: cannot open shared object file: No such file "
-        "or directory; with ROS from apt, source /opt/ros/jazzy/setup.bash before (for the unit: LD_LIBRARY_PATH in "
+        "or directory; with ROS from apt, first source /opt/ros/jazzy/setup.bash (for the unit: LD_LIBRARY_PATH in "
         "/etc/plr/sidecar.env, deploy/README.md)\n"
     )

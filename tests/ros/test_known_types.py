@@ -35,7 +35,7 @@ def rule(pattern: str) -> ServiceRule:
 def test_only_what_is_carried_and_lacks_its_type_is_named() -> None:
     peers = [cloud(("/plan", ABSENT), ("/where", TRIGGER), ("/not_ours", ABSENT))]
     [line] = missing_types(peers, [rule("/plan"), rule("/where")])
-    assert line.startswith(f"/plan, which cloud-1 offered last, will not be carried: service type {ABSENT} is not inst")
+    assert line.startswith(f"/plan, which cloud-1 offered last, cannot be carried: service type {ABSENT} is not inst")
     assert "nowhere_msgs" in line
 
 

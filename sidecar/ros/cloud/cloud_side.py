@@ -165,7 +165,7 @@ class CloudSide:
             why = "its time here was over before the server had room for it"
             self._data_plane.refuse(execution.id, RejectReason.OVERLOADED, why)
         elif event.awaited:
-            self._data_plane.refuse(execution.id, RejectReason.SERVER_LOST, "the server gave no answer in time")
+            self._data_plane.refuse(execution.id, RejectReason.SERVER_LOST, "the server did not answer in time")
 
     def _forget(self, execution: ExecutionId) -> tuple[ServiceRunner, Execution] | None:
         known = self._executions.pop(execution, None)
@@ -495,7 +495,7 @@ class CloudSide:
             runner = self._runners.pop(name)
             sent, unsent = runner.take_back()
             # Those at the server may have run; another server may run the rest.
-            self._refuse_executions(sent, name, RejectReason.SERVER_LOST, "the sidecar is going away")
-            self._refuse_executions(unsent, name, RejectReason.DRAINING, "the sidecar is going away")
+            self._refuse_executions(sent, name, RejectReason.SERVER_LOST, "the sidecar is shutting down")
+            self._refuse_executions(unsent, name, RejectReason.DRAINING, "the sidecar is shutting down")
             runner.close()
         self._loop.set_clients(())

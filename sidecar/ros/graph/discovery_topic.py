@@ -55,7 +55,7 @@ class DiscoveryTopic:
         except (ImportError, AttributeError, RosBridgeError) as error:
             self.usable = False
             log.error(
-                "the ROS processes of this domain can not be asked whether they live, nor for their nodes: %s", error
+                "the ROS processes of this domain cannot be asked for their nodes or whether they live: %s", error
             )
             return False
         return True

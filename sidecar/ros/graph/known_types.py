@@ -38,7 +38,7 @@ def missing_types(peers: Iterable[Peer], rules: Iterable[ServiceRule]) -> list[s
         if kind not in problems:
             problems[kind] = _problem(kind)
         if (problem := problems[kind]) is not None:
-            lines.append(f"{name}, which {server} offered last, will not be carried: {problem}")
+            lines.append(f"{name}, which {server} offered last, cannot be carried: {problem}")
     left_out = len(lines) - MAX_LINES
     return [*lines[:MAX_LINES], f"and {left_out} more"] if left_out > 0 else lines
 

@@ -83,7 +83,13 @@ class NodeNames:
                 learned |= self._unknown.learn(info)
             except RosBridgeError as error:
                 self._stats.dropped["bad_discovery_message"] += 1
-                self._limited.log(logging.WARNING, ("discovery", ""), now, "a ROS process of this domain: %s", error)
+                self._limited.log(
+                    logging.WARNING,
+                    ("discovery", ""),
+                    now,
+                    "the message of a ROS process of this domain is ignored: %s",
+                    error,
+                )
         self._learned |= learned
         return bool(learned)
 
@@ -93,6 +99,6 @@ class NodeNames:
         names = " ".join(sorted(self._learned)[:NAMES_LOGGED])
         if len(self._learned) > NAMES_LOGGED:
             names += f" and {len(self._learned) - NAMES_LOGGED} more"
-        why = "their process stood still for longer than DDS's lease, or this one did"
+        why = "their process, or this one, stood still for longer than DDS's lease"
         log.info("found nodes again whose names ROS had lost (%s): %s", why, names)
         self._learned.clear()

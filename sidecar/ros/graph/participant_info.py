@@ -46,12 +46,12 @@ def nodes_of(info: bytes) -> Iterator[tuple[str, frozenset[bytes]]]:
     """
     if len(info) > MAX_INFO_BYTES:
         raise RosBridgeError(
-            f"{len(info)} bytes are more than the {MAX_INFO_BYTES} that a process may say of its nodes"
+            f"a process lists its nodes in {len(info)} bytes, but at most {MAX_INFO_BYTES} are allowed"
         )
     reader = _Reader(info)
     nodes = reader.length()
     if nodes > MAX_NODES:
-        raise RosBridgeError(f"a process with {nodes} nodes, more than {MAX_NODES}")
+        raise RosBridgeError(f"a process has {nodes} nodes, but at most {MAX_NODES} are allowed")
     for _ in range(nodes):
         namespace = reader.name(_NAMESPACE)
         name = reader.name(_NAME)
@@ -67,9 +67,7 @@ class _Reader:
     def __init__(self, info: bytes) -> None:
         representation = info[:2]
         if representation not in (_LITTLE_ENDIAN, _BIG_ENDIAN):
-            raise RosBridgeError(
-                f"what a process says of its nodes is in the unknown representation {representation.hex()}"
-            )
+            raise RosBridgeError(f"the list of a process's nodes has the unknown representation {representation.hex()}")
         self._length = struct.Struct("<I" if representation == _LITTLE_ENDIAN else ">I")
         self._info = info
         self._at = _ENCAPSULATION_BYTES + ENDPOINT_BYTES
@@ -78,7 +76,7 @@ class _Reader:
         begin = -(-self._at // 4) * 4
         self._at = begin + 4
         if self._at > len(self._info):
-            raise RosBridgeError("what a process says of its nodes is cut off")
+            raise RosBridgeError("the list of a process's nodes is truncated")
         (found,) = self._length.unpack_from(self._info, begin)
         return int(found)
 
@@ -88,14 +86,14 @@ class _Reader:
     def name(self, form: re.Pattern[bytes]) -> str:
         size = self.length()
         if not 0 < size <= _MAX_NAME_BYTES:
-            raise RosBridgeError(f"a node's name or namespace of {size} bytes")
+            raise RosBridgeError(f"a node's name or namespace has {size} bytes")
         text = self._take(size)
         if text[-1] or not form.fullmatch(text[:-1]):
-            raise RosBridgeError(f"{text!r} is no node's name or namespace")
+            raise RosBridgeError(f"{text!r} is not a node's name or namespace")
         return text[:-1].decode("ascii")
 
     def _take(self, size: int) -> bytes:
         begin, self._at = self._at, self._at + size
         if self._at > len(self._info):
-            raise RosBridgeError("what a process says of its nodes is cut off")
+            raise RosBridgeError("the list of a process's nodes is truncated")
         return self._info[begin : self._at]

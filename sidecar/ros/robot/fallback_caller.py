@@ -229,7 +229,7 @@ class FallbackCaller:
     def _note_up(self, now: float) -> None:
         up = frozenset(name for name, fallback in self._fallbacks.items() if fallback.server.ready)
         for service in up - self._up:
-            log.info("service %s: its fallback %s is there", service, self._policy.services[service])
+            log.info("service %s: its fallback %s is available", service, self._policy.services[service])
         if up != self._up:
             self._up = up
             self._policy.set_up(up, now)
@@ -266,7 +266,7 @@ class FallbackCaller:
             self._complain(service, f"no node serves {name} on this robot: start the one that does", now)
         elif wanted not in types:
             found = ", ".join(sorted(types))
-            self._complain(service, f"{name} has type {found}, not {wanted} as the servers of {service}", now)
+            self._complain(service, f"{name} has type {found}, not {wanted} like the servers of {service}", now)
         elif retry_types or self._refused.get(service) != wanted:
             self._open(service, name, wanted, now)
 

@@ -87,7 +87,7 @@ class Proxies:
         self._free_since.pop(event.name, None)
         proxy = self._proxies.get(event.name)
         if proxy is not None and fallbacks.get(event.name) == proxy.type.name:
-            log.warning("service %s: its fallback alone answers from now on: %s", event.name, event.reason)
+            log.warning("service %s: only its fallback answers from now on: %s", event.name, event.reason)
         elif self._close_proxy(event.name):
             log.warning("service %s is withdrawn: %s", event.name, event.reason)
         self._publish_state()
@@ -140,7 +140,7 @@ class Proxies:
         self._left_alone[name] = others
         nodes = ", ".join(sorted(others))
         if self._close_proxy(name):
-            log.warning("service %s is now served by %s on this robot: ours is withdrawn", name, nodes)
+            log.warning("service %s is now served by %s on this robot: the sidecar withdraws its own", name, nodes)
         else:
             log.warning("service %s is already served by %s on this robot: left alone", name, nodes)
 

@@ -164,7 +164,7 @@ class RobotSide:
             logging.ERROR,
             (f"bad_response of {event.server}", event.service),
             now,
-            "%s: response from %s dropped, others are asked: %s",
+            "%s: response from %s dropped, other servers are asked: %s",
             event.service,
             event.server,
             error,

@@ -68,13 +68,13 @@ def test_lengths_that_the_bytes_do_not_bear_out_take_no_time() -> None:
     with pytest.raises(RosBridgeError, match="4294967295 nodes"):
         list(nodes_of(bytes(info)))
     info[-4:] = MAX_NODES.to_bytes(4, "little")
-    with pytest.raises(RosBridgeError, match="cut off"):
+    with pytest.raises(RosBridgeError, match="is truncated"):
         list(nodes_of(bytes(info)))
     endless = bytearray(participant_info(7, [("/", "planner", [], [])]))
     endless[-4:] = b"\xff\xff\xff\xff"
-    with pytest.raises(RosBridgeError, match="cut off"):
+    with pytest.raises(RosBridgeError, match="is truncated"):
         list(nodes_of(bytes(endless)))
-    with pytest.raises(RosBridgeError, match="are more than"):
+    with pytest.raises(RosBridgeError, match="are allowed"):
         list(nodes_of(bytes(info) + bytes(MAX_INFO_BYTES)))
 
 
