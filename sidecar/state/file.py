@@ -107,7 +107,7 @@ def decode_identity(data: bytes) -> Identity:
     """Read the file's content; raises DecodeError."""
     body = _open(_IDENTITY_MAGIC, data)
     if len(body) != _IDENTITY.size:
-        raise DecodeError(f"identity of {len(body)} bytes, not {_IDENTITY.size}")
+        raise DecodeError(f"the identity has {len(body)} bytes, not {_IDENTITY.size}")
     return Identity(*_IDENTITY.unpack(body))
 
 
@@ -129,12 +129,12 @@ def decode_last_good(data: bytes, owner: NodeName) -> LastGood:
         raise DecodeError("no owner")
     end = 1 + body[0]
     if body[1:end] != owner.encode():
-        raise DecodeError(f"written by the sidecar {body[1:end]!r}")
+        raise DecodeError(f"it was written by the sidecar {body[1:end]!r}")
     last = LastGood(owner)
     while end < len(body):
         message, end = _pull_message(body, end)
         if isinstance(message, PeerSet) and (message.base or message.more):
-            raise DecodeError("it holds a part of a peer set")
+            raise DecodeError("it holds only a part of a peer set")
         last = last.with_message(message)
     return last
 
@@ -159,7 +159,7 @@ def decode_clock_floor(data: bytes) -> float:
     try:
         (microseconds,) = _MICROSECONDS.unpack(_open(_CLOCK_MAGIC, data))
     except struct.error:
-        raise DecodeError("the clock's floor is not of 8 bytes") from None
+        raise DecodeError("the clock's floor does not have 8 bytes") from None
     return float(microseconds) / 1e6
 
 
@@ -199,18 +199,18 @@ def _text(text: str) -> bytes:
 def _pull_text(body: bytes, start: int) -> tuple[str, int]:
     end = start + 1 + body[start]
     if end > len(body):
-        raise DecodeError("text cut off")
+        raise DecodeError("truncated text")
     return body[start + 1 : end].decode(), end
 
 
 def _pull_message(body: bytes, start: int) -> tuple[ControlMessage, int]:
     begin = start + _LENGTH.size
     if begin > len(body):
-        raise DecodeError("message length cut off")
+        raise DecodeError("truncated message length")
     (length,) = _LENGTH.unpack_from(body, start)
     end = begin + length
     if end > len(body):
-        raise DecodeError("message cut off")
+        raise DecodeError("truncated message")
     return parse_control_message(body[begin:end]), end
 
 
@@ -220,7 +220,7 @@ def _seal(magic: bytes, body: bytes, version: int = FORMAT_VERSION) -> bytes:
 
 def _open(magic: bytes, data: bytes, known_version: int = FORMAT_VERSION) -> bytes:
     if len(data) < _HEADER.size:
-        raise DecodeError(f"{len(data)} bytes are no header")
+        raise DecodeError(f"{len(data)} bytes are too short for a header")
     found, version, length, digest = _HEADER.unpack_from(data)
     if found != magic:
         raise DecodeError("not a file of this kind")
@@ -228,7 +228,7 @@ def _open(magic: bytes, data: bytes, known_version: int = FORMAT_VERSION) -> byt
         raise DecodeError(f"format version {version}, not {known_version}")
     body = data[_HEADER.size :]
     if len(body) != length:
-        raise DecodeError(f"body of {len(body)} bytes, not {length}")
+        raise DecodeError(f"the body has {len(body)} bytes, not {length}")
     if hashlib.sha256(body).digest() != digest:
         raise DecodeError("wrong checksum")
     return body

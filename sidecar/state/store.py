@@ -195,7 +195,7 @@ class StateStore:
             return None
         except (OSError, DecodeError) as error:
             self.failures[f"{name.replace('-', '_')}_refused"] += 1
-            log.error("%s refused (%s), set aside as %s", path, error, name + SET_ASIDE_SUFFIX)
+            log.error("%s is refused (%s) and set aside as %s", path, error, name + SET_ASIDE_SUFFIX)
             self._set_aside(name)
             return None
 
@@ -213,11 +213,13 @@ class StateStore:
             if name not in self._failing:
                 self._failing.add(name)
                 path = self._folder.path / name
-                log.error("%s not written: %s; tried again, and a restart before will not know it", path, error)
+                log.error(
+                    "%s is not written: %s; the sidecar tries again, and a restart before that loses it", path, error
+                )
             return False
         if name in self._failing:
             self._failing.remove(name)
-            log.info("%s is on the disk again", self._folder.path / name)
+            log.info("%s is written to the disk again", self._folder.path / name)
         return True
 
 
@@ -255,7 +257,7 @@ def _lock(path: Path) -> tuple[OwnFolder, int]:
 
 
 def _unusable(error: OSError) -> StateDirError:
-    return StateDirError(f"expected a folder that can be written: {error.strerror or error}")
+    return StateDirError(f"expected a writable folder: {error.strerror or error}")
 
 
 def _open_lock(folder: OwnFolder) -> int:

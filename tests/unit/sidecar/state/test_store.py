@@ -202,7 +202,7 @@ def test_a_second_sidecar_is_kept_out_until_the_first_is_gone(tmp_path: Path) ->
 
 def test_a_folder_that_cannot_be_made_is_an_error(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
-    with pytest.raises(StateDirError, match="a folder that can be written"):
+    with pytest.raises(StateDirError, match="a writable folder"):
         StateStore(tmp_path / "file" / "state", OWNER)
 
 
@@ -233,7 +233,7 @@ def test_a_spoilt_file_is_set_aside_and_counted_and_the_sidecar_starts(
     store = StateStore(tmp_path, OWNER)
     store.close()
     assert dict(store.failures) == {f"{name.replace('-', '_')}_refused": 1}
-    assert f"{path} refused" in caplog.text
+    assert f"{path} is refused" in caplog.text
     assert (tmp_path / f"{name}.refused").read_bytes() == spoilt
     assert (store.last_good == LastGood(OWNER)) == (name == LAST_GOOD_FILE)
     assert len(store.identity.token) == 16
@@ -273,7 +273,7 @@ def test_a_failing_write_is_counted_and_logged(tmp_path: Path, caplog: pytest.Lo
     store.remember(PEERS)
     store.close()
     assert set(store.failures) == {"write_failed"}
-    assert "tried again, and a restart before will not know it" in caplog.text
+    assert "the sidecar tries again, and a restart before that loses it" in caplog.text
 
 
 @pytest.mark.audit("ops-10")
