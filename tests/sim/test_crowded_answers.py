@@ -119,7 +119,7 @@ def test_what_has_no_room_to_wait_is_told_at_once(monkeypatch: pytest.MonkeyPatc
     ask(robot, 70)
     mesh.run(2.0)
     assert {event.outcome for event in failed(robot)} == {"rejected"}
-    assert all("too much waits to be sent" in event.reason for event in failed(robot))
+    assert all("too much data already waits to be sent" in event.reason for event in failed(robot))
     mesh.run(30.0)
     assert len(failed(robot)) == cloud.engine.stats.dropped["answers_full"] == 60
     assert len(robot.responses()) == 10
@@ -131,7 +131,7 @@ def test_an_answer_that_waits_until_its_time_is_over_is_told_before() -> None:
     mesh, robot, cloud = world(mbit=1.0, lifetime_s=10.0)
     ask(robot, 12)
     mesh.run(20.0)
-    told = [event for event in failed(robot) if "nothing of it could leave" in event.reason]
+    told = [event for event in failed(robot) if "no part of it could be sent" in event.reason]
     assert len(robot.responses()) + len(failed(robot)) == 12
     assert 0 < len(robot.responses()) < 5
     assert len(told) == cloud.engine.stats.dropped["answer_unsent"] > 6

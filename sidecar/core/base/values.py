@@ -60,7 +60,7 @@ class RejectReason(enum.IntEnum):
     OVERLOADED = 4
     """A table is full."""
     DRAINING = 5
-    """The sidecar is going away."""
+    """The sidecar is shutting down."""
     SERVER_LOST = 6
     """The local server went away or gave no answer in time: the request may have run."""
     FORGOTTEN = 7

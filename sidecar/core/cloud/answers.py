@@ -185,7 +185,7 @@ class Answers:
             return None
         if held and not (self._byte_shares.fits(robot, held) or self._let_copies_go(robot, held)):
             self._stats.dropped["answers_full"] += 1
-            return self._enter(self._refusal(answer, "too much waits to be sent to this robot already"), now)
+            return self._enter(self._refusal(answer, "too much data already waits to be sent to this robot"), now)
         self._number_shares.take(robot)
         self._byte_shares.take(robot, held)
         self._answers[answer.number] = answer
@@ -195,7 +195,7 @@ class Answers:
         return answer
 
     def _refusal(self, answer: _Answer, why: str) -> Reply:
-        text = f"it ran, but its answer of {answer.held} bytes is not sent: {why}"
+        text = f"the request ran, but its answer of {answer.held} bytes is not sent: {why}"
         rejection = RejectionMessage(answer.request_id, answer.reply.waiter.copy, RejectReason.FORGOTTEN, text)
         # The answer's deadline may be over; the rejection is useful until `expires`, and waits behind no large answer.
         return replace(answer.reply, message=rejection, priority=Priority.HIGH, deadline=answer.reply.expires)
@@ -395,7 +395,7 @@ class Answers:
             self.send(self._refusals(answer), now)
 
     def _refusals(self, answer: _Answer) -> list[Reply]:
-        refusal = self._refusal(answer, "nothing of it could leave until its time was nearly over")
+        refusal = self._refusal(answer, "no part of it could be sent before its time was nearly over")
         return [
             replace(refusal, waiter=Waiter(path, copy), message=replace(refusal.message, copy=copy))
             for copy, path in {**answer.sent, **answer.waiting}.items()

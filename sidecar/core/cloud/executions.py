@@ -359,7 +359,7 @@ class ExecutionTable:
                     continue
             self._finish(execution_id)
             self._remember(execution, now)
-            execution.refusal = (RejectReason.SERVER_LOST, "the server gave no answer in time")
+            execution.refusal = (RejectReason.SERVER_LOST, "the server did not answer in time")
             if awaited:
                 replies += [self._reply(execution, waiter, execution.expires) for waiter in execution.waiters]
         return abandoned, replies
@@ -387,7 +387,10 @@ class ExecutionTable:
         if execution.payload is not None:
             response = ResponseMessage(request_id, waiter.copy, execution.processing_s, execution.payload)
             return Reply(waiter, execution.service, response, execution.priority, execution.deadline, expires)
-        reason, text = execution.refusal or (RejectReason.FORGOTTEN, "answered before; the answer is gone")
+        reason, text = execution.refusal or (
+            RejectReason.FORGOTTEN,
+            "the request was answered before, and its answer is no longer kept",
+        )
         rejection = RejectionMessage(request_id, waiter.copy, reason, text)
         return Reply(waiter, execution.service, rejection, execution.priority, execution.deadline, expires)
 

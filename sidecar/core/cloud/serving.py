@@ -104,7 +104,7 @@ class Serving:
         if offer is None:
             return RejectReason.NOT_OFFERED, f"no server for {message.service}"
         if self._draining:
-            return RejectReason.DRAINING, "the sidecar is going away"
+            return RejectReason.DRAINING, "the sidecar is shutting down"
         if offer.type != message.type:
             return RejectReason.WRONG_TYPE, f"{message.service} has type {offer.type}, not {message.type}"
         return None

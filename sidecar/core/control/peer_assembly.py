@@ -64,11 +64,11 @@ class PeerAssembly:
         names = Counter([*(peer.name for peer in said.peers), *(gone.name for gone in said.removed)])
         if len(names) < len(said.peers) + len(said.removed):
             (name, _), *_ = names.most_common(1)
-            return f"{name} stands in it twice"
+            return f"{name} appears twice in it"
         if not said.base:
             return said
         if said.base != self._version:
-            return f"these are changes upon version {said.base}; in force is {self._version}"
+            return f"these changes are based on version {said.base}, but version {self._version} is in force"
         whole = put_upon(self._held, said)
         return whole if len(whole.peers) <= MAX_PEERS else f"more than {MAX_PEERS} peers"
 

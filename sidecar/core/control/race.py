@@ -76,4 +76,4 @@ class ControlRace:
         """Return the outcome of every way so far, in words."""
         told = [f"{way}: {why}" for way, why in self.failures.items() if way not in self._running]
         told += [f"{way}: no answer" for way in sorted(self._running, key=str)]
-        return "; ".join(told) or "there is no way to it"
+        return "; ".join(told) or "no interface or route leads to it"

@@ -303,7 +303,11 @@ class ControlSession:
         least = max(self._taken.get(resource, Version(0)), Version(1))
         if content.version < least:
             self.stats.ignored[f"{resource.value}_older"] += 1
-            self._nack(resource, content.nonce, f"version {content.version} is older than {least} of this stream")
+            self._nack(
+                resource,
+                content.nonce,
+                f"version {content.version} is older than {least}, which this stream has already had",
+            )
             return False
         return True
 

@@ -119,13 +119,13 @@ class ControlWatch:
         """Return the decision to leave it now, or None; call `saw` first."""
         over = self._over
         if over is not None and not self._ways.has(over):
-            return Leave(GONE, f"{over} carries nothing any more")
+            return Leave(GONE, f"{over} no longer carries anything")
         limit_s = self._limit_s(now)
         if limit_s is not None and self._waiting_since is not None and now >= self._waiting_since + limit_s:
-            return Leave(SILENT, f"nothing comes over {over or 'its interface'}")
+            return Leave(SILENT, f"nothing arrives over {over or 'its interface'}")
         better = self._ways.better(over, now)
         if better and self._waiting_since is None:
-            return Leave(CHEAPER, f"{better[0].interface} is well, and costs less than {over}", tuple(better))
+            return Leave(CHEAPER, f"{better[0].interface} works, and costs less than {over}", tuple(better))
         return None
 
     def _limit_s(self, now: float) -> float | None:

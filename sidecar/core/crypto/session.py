@@ -61,23 +61,23 @@ class OwnSession:
             DecodeError: the credential is malformed, not of this peer, or refused by `verify`; the text says why.
         """
         if peer.session in self._condemned:
-            raise DecodeError("it acknowledged what was never sent: not talked to until it is restarted")
+            raise DecodeError("it acknowledged datagrams that were never sent: it is refused until it restarts")
         known = self._admitted.get(peer.credential)
         theirs = decode_credential(peer.credential)
         if (theirs.name, theirs.role, theirs.session, theirs.incarnation) != (
             peer.name, peer.role, peer.session, peer.incarnation,
         ):  # fmt: skip
-            raise DecodeError("the credential is of another node or session")
+            raise DecodeError("the credential belongs to another node or session")
         if known is not None:
             return known[0]
         if (theirs.name, theirs.role) == (self.credential.name, self.credential.role):
-            raise DecodeError("the credential is of a node with our own name and role")
+            raise DecodeError("the credential belongs to a node with our own name and role")
         ends_at = self._verify(theirs)
         try:
             their_key = X25519PublicKey.from_public_bytes(theirs.public_key)
             keys = pair_keys(self._private_key, their_key, self.credential, theirs)
         except ValueError:  # a point of small order (RFC 7748 section 6.1)
-            raise DecodeError("the credential's public key is of small order") from None
+            raise DecodeError("the credential's public key has small order") from None
         if len(self._admitted) >= MAX_ADMITTED:
             self._admitted.clear()
         self._admitted[peer.credential] = keys, ends_at
@@ -134,7 +134,7 @@ class OwnSession:
             ValueError: it belongs to another session.
         """
         if credential.identity != self.credential.identity:
-            raise ValueError("a credential of another session")
+            raise ValueError("the credential belongs to another session")
         self.credential = credential
 
     def forget_admitted(self) -> None:

@@ -78,7 +78,7 @@ class Announced:
                 return "", newest  # it has a new run or certificate, with which it is about to sign them
             if (told.incarnation, told.candidates_serial) <= (newest.incarnation, newest.serial):
                 self._dropped["old_candidates"] += 1
-                return "they are older than what it announced before", newest
+                return "they are older than its earlier announcement", newest
         try:
             signed = self._own.check_candidates(told)
         except DecodeError as error:

@@ -211,7 +211,7 @@ class KeyExchange:
 
 def _pay(budget: TokenBucket | None, now: float) -> None:
     if budget is not None and not budget.take(now):
-        raise TooManyExchangesError("too many exchanges of keys")
+        raise TooManyExchangesError("too many key exchanges")
 
 
 def _public(key: bytes) -> X25519PublicKey:
@@ -222,4 +222,4 @@ def _shared(private: X25519PrivateKey, public: X25519PublicKey) -> bytes:
     try:
         return private.exchange(public)
     except ValueError:  # RFC 7748 section 6.1
-        raise DecodeError("a public key of small order") from None
+        raise DecodeError("the public key has small order") from None

@@ -281,7 +281,7 @@ class RequestTable:
             if request.may_be_sent() and self._dispatching.candidates(request):
                 self._requests.strand(request)
             else:
-                why = f"bad answer of {server} (others go before it for {out_s:.0f} s): {problem}"
+                why = f"bad answer from {server} (other servers are preferred for {out_s:.0f} s): {problem}"
                 self._fail(request, "failed", why, now)
 
     def on_rejection(self, server: NodeName, rejection: RejectionMessage, now: float) -> None:

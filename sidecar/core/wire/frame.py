@@ -232,9 +232,9 @@ def decode_header(data: bytes | memoryview) -> Header:
     if first not in FIRST_BYTES:
         if first & 0xF0 == FIRST_BYTE & 0xF0:
             raise VersionError(f"protocol version {first & 0x0F}, ours is {PROTOCOL_VERSION}")
-        raise DecodeError("not one of our datagrams")
+        raise DecodeError("not a datagram of this protocol")
     if not flags & SEALED_FLAG:
-        raise UnsealedError("in clear")
+        raise UnsealedError("not sealed")
     if flags not in _KNOWN_FLAGS:
         raise DecodeError("unknown flags")
     return Header(InterfaceId(sender), InterfaceId(receiver), SessionId(session), packet_number, flags)
@@ -353,7 +353,7 @@ def decode_frames(view: memoryview) -> list[Frame]:
                 frames.append(Close())
             elif kind in (_KEY_OFFER, KEY_ANSWER_TYPE):
                 if exchanging:
-                    raise DecodeError("more than one offer or answer of keys")
+                    raise DecodeError("more than one key offer or key answer")
                 exchanging = True
                 frames.append((KeyOffer if kind == _KEY_OFFER else KeyAnswer)(*_NEW_KEY.unpack_from(view, position)))
                 position += _NEW_KEY.size
@@ -401,7 +401,7 @@ def _decode_fragment(kind: int, view: memoryview, position: int) -> tuple[Fragme
         length = min(symbol, total - start)
     else:
         if not is_repair_index(index, total, symbol):
-            raise DecodeError("repair symbol that no block has")
+            raise DecodeError("repair symbol beyond the end of its message")
         length = symbol
     data = view[position : position + length]
     if len(data) != length:

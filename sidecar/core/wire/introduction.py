@@ -101,15 +101,15 @@ def open_introduction(header: Header, datagram: memoryview, token: bytes, receiv
         DecodeError: its content breaks the layout, or belongs to another session.
     """
     if len(datagram) < _SEALED_FROM:
-        raise DecodeError("introduction cut off")
+        raise DecodeError("truncated introduction")
     clear = bytes(datagram[:_SEALED_FROM])
     try:
         cipher = _cipher(header, token, receiver)
         plain = cipher.decrypt(clear[NONCE_OFFSET:HEADER_BYTES], datagram[_SEALED_FROM:], clear)
     except InvalidTag:
-        raise UnauthenticError("not of one who knows the token") from None
+        raise UnauthenticError("the sender does not know the token") from None
     if len(plain) < _HEAD.size:
-        raise DecodeError("introduction cut off")
+        raise DecodeError("truncated introduction")
     credential = decode_credential(plain[_HEAD.size :])
     if credential.session != header.session:
         raise DecodeError("introduction with the credential of another session")

@@ -185,7 +185,7 @@ def decode_message(view: memoryview) -> Message:
         kind, request_id, copy = _HEAD.unpack_from(view)
         decode = _DECODERS.get(kind)
         if decode is None:
-            raise UnknownKindError(f"a message of no known kind, {kind}: its sender is newer")
+            raise UnknownKindError(f"unknown message kind {kind}: the sender is newer")
         return decode(RequestId(request_id), copy, view, _HEAD.size)
     except struct.error:
         raise DecodeError("truncated message") from None

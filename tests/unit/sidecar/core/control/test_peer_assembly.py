@@ -34,7 +34,7 @@ def test_changes_are_put_upon_the_set_in_force() -> None:
     assert names(whole) == {"b", "c"}
     assert whole == PeerSet(Version(6), 2, (peer("b", 2), peer("c")), (gone("a"),), 9)
     # Not in force yet: what comes next may be upon the one before.
-    assert "in force is 5" in str(assembly.whole(PeerSet(Version(7), 3, (), (), 9, Version(6))))
+    assert "version 5 is in force" in str(assembly.whole(PeerSet(Version(7), 3, (), (), 9, Version(6))))
     assert isinstance(whole, PeerSet)
     assembly.in_force(whole)
     assert names(assembly.whole(PeerSet(Version(7), 3, (), (gone("c"),), 9, Version(6)))) == {"b"}
@@ -117,7 +117,7 @@ def test_who_is_named_twice_in_one_set_makes_it_none_and_what_is_held_stays(
     assembly.take(PeerSet(Version(6), 2, *first, base=Version(base), more=True))
     said = assembly.take(PeerSet(Version(6), 2, *then, base=Version(base)))
     assert said is not None
-    assert assembly.whole(said) == "a stands in it twice"
+    assert assembly.whole(said) == "a appears twice in it"
     assert assembly.is_upon(said)
     after = PeerSet(Version(7), 3, (peer("c"),), base=Version(5))
     assert names(assembly.whole(after)) == {"a", "b", "c"}

@@ -66,4 +66,4 @@ def test_no_ways() -> None:
     race = ControlRace([], 0.0)
     assert race.over
     assert race.next_timer() is None
-    assert race.outcome() == "there is no way to it"
+    assert race.outcome() == "no interface or route leads to it"

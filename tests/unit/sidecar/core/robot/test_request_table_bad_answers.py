@@ -54,7 +54,7 @@ def test_with_two_bad_answers_both_are_asked_no_more_and_the_request_ends_with_i
     table.respond(B, copy=1, now=0.1001)
     table.judge(0.11, "garbage")
     assert table.stats.bad_answers == {(A, ECHO): 1, (B, ECHO): 1}
-    assert "bad answer of cloud-b" in table.only_failure().reason
+    assert "bad answer from cloud-b" in table.only_failure().reason
     table.assert_empty()
 
 
@@ -92,7 +92,7 @@ def test_what_may_run_only_once_fails_with_its_reason() -> None:
     assert copies == 1
     failure = table.only_failure()
     assert failure.outcome == "failed"
-    assert "bad answer of cloud-a" in failure.reason
+    assert "bad answer from cloud-a" in failure.reason
     assert "garbage" in failure.reason
     table.assert_empty()
 

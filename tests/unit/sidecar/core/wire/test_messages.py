@@ -73,7 +73,7 @@ def test_other_kinds_reasons_and_text_are_refused() -> None:
 
 @pytest.mark.audit("ops-10")
 def test_what_only_a_newer_sidecar_knows_is_told_from_what_is_broken() -> None:
-    with pytest.raises(UnknownKindError, match="kind, 8: its sender is newer"):
+    with pytest.raises(UnknownKindError, match="kind 8: the sender is newer"):
         decode_message(memoryview(bytes.fromhex("08" + ID.hex() + "00")))
     refused = decode_message(memoryview(bytes.fromhex("03" + ID.hex() + "00 ff 0000")))
     assert isinstance(refused, RejectionMessage)
