@@ -54,13 +54,13 @@ _DESCRIPTION = "Carries the ROS 2 service calls of a robot to cloud servers over
 _EPILOG = """\
 examples:
   plr-sidecar --config /etc/plr/sidecar.yaml                  run until SIGTERM or Ctrl-C
-  plr-sidecar --config /etc/plr/sidecar.yaml --check-config   say whether the configuration is right
-  plr-sidecar --print-schema > sidecar.schema.json            describe the configuration to an editor
+  plr-sidecar --config /etc/plr/sidecar.yaml --check-config   check the configuration and exit
+  plr-sidecar --print-schema > sidecar.schema.json            print a schema for an editor
 
 exit codes:
-  0  stopped as asked, or the configuration is right
-  1  failed while running, or cannot have its state_dir now, which --check-config does not try; the log says why
-  2  wrong usage or configuration; one line on stderr names the file, the key and what was expected
+  0  stopped on request, or the configuration is valid
+  1  failed at run time, or state_dir cannot be used (--check-config does not try it); the log says why
+  2  wrong usage or configuration; one line on stderr names the file, the key and the expected value
 """
 
 
@@ -111,7 +111,8 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "--insecure-i-know",
         action="store_true",
-        help="allow insecure: true with a control plane on another machine: anybody between may read and change all",
+        help="accept insecure: true with a control plane on another machine: anybody in between can read and change "
+        "all data",
     )
     parser.add_argument("--version", action=ShowVersion)
     return parser
@@ -128,7 +129,9 @@ def _warn_of_missing_interfaces(config: SidecarConfig) -> None:
 def _warn_of_short_deadlines(config: SidecarConfig) -> None:
     for number, service in enumerate(config.services):
         if service.deadline_ms is not None and service.deadline_ms < SHORT_DEADLINE_MS:
-            problem = f"{service.deadline_ms:g} ms is less than any network takes; the unit is milliseconds"
+            problem = (
+                f"{service.deadline_ms:g} ms is shorter than the round trip of any network; the unit is milliseconds"
+            )
             sys.stderr.write(f"{PROGRAM}: warning: services[{number}].deadline_ms: {problem}\n")
 
 
@@ -216,9 +219,9 @@ def _stop_on_signals_and_crashes(stop: StopRequest) -> threading.Event:
     def on_crash(crash: threading.ExceptHookArgs) -> None:
         name = crash.thread.name if crash.thread else "a thread"
         value = crash.exc_value or crash.exc_type()
-        log.critical("%s died: stopping", name, exc_info=(crash.exc_type, value, crash.exc_traceback))
+        log.critical("%s died: the sidecar stops", name, exc_info=(crash.exc_type, value, crash.exc_traceback))
         failure.set()
-        stop.set(f"as {name} died")
+        stop.set(f"because {name} died")
 
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, on_signal)

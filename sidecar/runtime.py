@@ -168,7 +168,11 @@ class Sidecar:
             try:
                 self._local.open()
             except LocalSocketError as error:
-                log.warning("%s: no local socket, plr doctor sees only the configuration: %s", self._local.path, error)
+                log.warning(
+                    "%s: the local socket is missing, so plr doctor sees only the configuration: %s",
+                    self._local.path,
+                    error,
+                )
         self._data_plane.start()
         last = self._store.last_good
         if self._revocations is not None:
@@ -207,7 +211,7 @@ class Sidecar:
             elif name in stats.mismatched:
                 line = told_mismatched(name)
             elif robot:
-                line = told(name, self._data_plane.services_of_peers(), "no server that this robot knows of")
+                line = told(name, self._data_plane.services_of_peers(), "no server that this robot knows")
             else:
                 line = told(name, stats.carried, "no node of this host's ROS domain")
             log.warning("%s", line)
@@ -353,8 +357,8 @@ class Sidecar:
     def _log_changes(self, mapping: MappingSet) -> None:
         for service in mapping.services:
             if self._logged_mappings.get(service.service) != service.assignments:
-                pairs = ", ".join(f"{pair.interface} to {pair.server}" for pair in service.assignments)
-                log.info("mapping %d: %s goes %s: %s", mapping.version, service.service, pairs, service.reason)
+                pairs = ", ".join(f"{pair.interface} to {pair.server}" for pair in service.assignments) or "no path"
+                log.info("mapping %d: %s goes over %s: %s", mapping.version, service.service, pairs, service.reason)
         self._logged_mappings = {service.service: service.assignments for service in mapping.services}
 
     def look_at_revocations(self) -> None:
@@ -387,7 +391,7 @@ class Sidecar:
     def connection_changed(self, connected: bool, reason: str) -> None:
         """Note that the control plane was reached or lost."""
         if not connected:
-            log.debug("without control plane (%s): going on with the last peers and mapping", reason)
+            log.debug("not connected to the control plane (%s): the last peers and mapping stay in force", reason)
 
 
 def _open_store(config: SidecarConfig) -> StateStore:
@@ -404,7 +408,7 @@ def run(config: SidecarConfig, version: str, stopping: StopRequest) -> int:
         StartError: the state folder cannot be used now.
     """
     if config.insecure:
-        log.warning("insecure: true: the control plane and every peer are believed to be who they say")
+        log.warning("insecure: true: the identities of the control plane and of all peers are not checked")
     sidecar = Sidecar(config, version)
     notifier = Notifier()
     sidecar.start()
@@ -415,7 +419,7 @@ def run(config: SidecarConfig, version: str, stopping: StopRequest) -> int:
         notifier.status(sidecar.status_line())
         sidecar.look_at_services()
         reason = stopping.wait(STATUS_EVERY_S)
-    log.info("stopping %s: no new requests, finishing those in flight", reason)
+    log.info("stopping %s: the sidecar takes no new requests and finishes those in flight", reason)
     notifier.stopping()
     sidecar.stop()
     return 0

@@ -68,7 +68,11 @@ class Announcer:
     def _log_left_out(self, found: tuple[Candidate, ...]) -> None:
         left_out = Counter(one.interface for one in found) - Counter(one.interface for one in self._candidates)
         for name in left_out.keys() - self._left_out.keys():
-            log.warning("%s: %d of its addresses are not announced: peers use few of each", name, left_out[name])
+            log.warning(
+                "%s: %d of its addresses are not announced: peers use only a few of each interface",
+                name,
+                left_out[name],
+            )
         self._left_out.update(left_out)  # logged once in a run
 
 

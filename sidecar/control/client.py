@@ -185,7 +185,7 @@ class ControlClient:
         if self._thread.is_alive():
             self._thread.join(4.0 * GOODBYE_S)
             if self._thread.is_alive():
-                log.warning("the control client does not end; leaving it behind")
+                log.warning("the control client did not stop in time and is abandoned")
 
     def _post(self, action: Callable[[], None]) -> None:
         """Run `action` on the control thread; before `start`, on the calling thread."""
@@ -299,7 +299,7 @@ class ControlClient:
         self._note_connection(False, "stopped" if self._stopping else ended.reason)
         self.last_failure = None if ended.wanted else ended.reason
         if ended.wanted:
-            log.info("opening a new stream: %s", ended.reason)
+            log.info("opening a new control stream: %s", ended.reason)
         elif not self._stopping:
             self._outage.failed(ended.reason, delay_s, time.monotonic(), was_connected=was_connected)
 
@@ -376,7 +376,7 @@ class ControlClient:
         """Give up on an overdue welcome: in a network that swallows everything, gRPC alone would try for 20 s."""
         await asyncio.sleep(max(self._session.next_timer() - time.monotonic(), 0.0))
         if self._session.welcome_overdue(time.monotonic()):
-            raise _StreamEndedError(line.describe() or f"no answer to the registration at {line.way}")
+            raise _StreamEndedError(line.describe() or f"no answer to the registration over {line.way}")
 
     def _on_message(self, message: control_pb2.ControlMessage) -> None:
         try:
@@ -432,7 +432,9 @@ class ControlClient:
         if apply is not None and self._put_in_force(apply)[0] is None:
             self._session.applied_late()
             self._refusals.taken(apply.resource)
-            log.info("%s version %d fits now", apply.resource.value, apply.content.version)
+            log.info(
+                "%s version %d, which was refused before, is in force now", apply.resource.value, apply.content.version
+            )
 
     def _take_report(self, scope: ReportScope) -> Report:
         report = Report()

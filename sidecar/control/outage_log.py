@@ -38,7 +38,7 @@ class OutageLog:
             self._kind = kind
         what = "lost" if was_connected else "not reached"
         write(
-            "control plane %s %s: %s; going on without it, attempt %d in %.1f s",
+            "control plane %s %s: %s; the sidecar continues without it, attempt %d in %.1f s",
             self._target,
             what,
             reason,

@@ -52,7 +52,7 @@ class RevocationState:
     lists: Mapping[int, RevocationList | None]
     """As `Trust.lists`."""
     too_old: frozenset[int]
-    """CAs whose lists are too old; nodes that they certified are not talked to."""
+    """CAs whose lists are too old; nodes that they certified are refused."""
     max_age_s: float
 
 
@@ -91,7 +91,7 @@ class Revocations:
     def heard(self, peer: NodeName, pem: bytes) -> None:
         """Queue lists that a peer sent; `look` judges them."""
         if len(self._heard) == MAX_HEARD:
-            log.warning("a revocation list is dropped unseen: %d others wait to be judged", MAX_HEARD)
+            log.warning("a revocation list is dropped unread: %d others already wait to be checked", MAX_HEARD)
             return
         self._heard.append((peer, pem))
 
@@ -101,7 +101,7 @@ class Revocations:
             return False
         trust = self._tls.current.trust
         shown = ", ".join(f"number {one.number}" for one in trust.lists().values() if one is not None)
-        log.info("took a new revocation list of %s: %s", source, shown)
+        log.info("took a new revocation list from %s: %s", source, shown)
         self._remember(trust.crl_pem())
         self._user.trust_changed()
         self.tell()
@@ -112,7 +112,7 @@ class Revocations:
         try:
             self.take(pem, source)
         except CertificateError as error:
-            log.warning("a revocation list of %s is ignored: %s", source, error)
+            log.warning("a revocation list from %s is ignored: %s", source, error)
 
     def tell(self) -> None:
         """Tell the data plane and the operator which lists are in use; they may have changed."""
@@ -120,7 +120,7 @@ class Revocations:
         pem = trust.crl_pem()
         too_long = len(pem) > MAX_CRL_BYTES
         if too_long and not self._too_long:
-            log.error("the revocation lists are longer than %d bytes: peers are not told of them", MAX_CRL_BYTES)
+            log.error("the revocation lists have more than %d bytes: they are not sent to peers", MAX_CRL_BYTES)
         self._too_long = too_long
         self._say()
         numbers = {ca: -1 if one is None else one.number for ca, one in trust.lists().items()}
@@ -141,7 +141,11 @@ class Revocations:
         except CertificateError as error:
             self._user.judged_revocations(peer, good=False)
             if peer not in self._complained:
-                log.warning("a revocation list of %s is ignored, and it is not asked for an hour: %s", peer, error)
+                log.warning(
+                    "a revocation list from %s is ignored, and this peer is not asked again for an hour: %s",
+                    peer,
+                    error,
+                )
                 self._complained.add(peer)
             return
         if taken:
@@ -152,7 +156,10 @@ class Revocations:
         ahead_s = max((one.signed_at - now_wall for one in trust.lists().values() if one is not None), default=0.0)
         behind = ahead_s > CLOCK_SLACK_S
         if behind and not self._clock_behind:
-            log.error("a revocation list was signed %.0f s from now: this clock is behind, or the CA's ahead", ahead_s)
+            log.error(
+                "a revocation list was signed %.0f s in the future: this clock is behind, or the CA's clock is ahead",
+                ahead_s,
+            )
         self._clock_behind = behind
         too_old = trust.too_old(now_wall, self._max_age_s)
         if too_old == self._too_old:
@@ -160,14 +167,14 @@ class Revocations:
         if too_old:
             log.error(
                 "the revocation lists of %d of %d CAs are older than max_revocation_age_s (%.0f s) by this clock, or "
-                "not here: their nodes are not talked to until newer ones come (plr ca publish); if the lists are "
+                "missing: nodes of these CAs are refused until newer lists arrive (plr ca publish); if the lists are "
                 "newer than that, this clock is wrong",
                 len(too_old),
                 len(trust.lists()),
                 self._max_age_s,
             )
         else:
-            log.warning("the revocation lists are new enough again: peers are talked to")
+            log.warning("the revocation lists are recent enough again: their nodes are accepted")
         self._too_old = too_old
         self._say()
         self._user.trust_changed()

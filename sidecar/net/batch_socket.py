@@ -152,7 +152,7 @@ class BatchSocket:
 
     def _stop_segmenting(self, error: OSError) -> None:
         log.info(
-            "%s: the kernel will not cut datagrams for us (%s): sent one by one from now on",
+            "%s: the kernel does not segment datagrams (%s): they are sent one by one from now on",
             self._stats.interface,
             error.strerror,
         )

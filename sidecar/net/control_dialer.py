@@ -232,7 +232,7 @@ class ControlLine:
             return None
         if self._dialer.ways.empty:
             return f"no address of {', '.join(self._dialer.names)} is known"
-        return "nothing is connected" if self._race is None else self._race.outcome()
+        return "no connection has been tried" if self._race is None else self._race.outcome()
 
     def let_in(self) -> None:
         """Note that a control plane registered us."""
@@ -258,9 +258,9 @@ class ControlLine:
                 with connection.sock:
                     await self._carry(inside, connection)
         except OSError as error:
-            self._end(f"the line to the control plane failed: {words(error)}")
+            self._end(f"the connection to the control plane failed: {words(error)}")
         except Exception:
-            log.exception("the line to the control plane failed")
+            log.exception("the connection to the control plane failed")
             self._end("internal error")
 
     def _end(self, why: Leave | str) -> None:

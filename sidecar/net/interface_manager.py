@@ -119,7 +119,11 @@ class InterfaceManager:
             self._watch.subscribe()
             self._schedule = ScanSchedule(time.monotonic(), has_news=True)
         except OSError as error:
-            log.warning("changes of interfaces are not announced (%s): looking every %g s", error, WITHOUT_NEWS_S)
+            log.warning(
+                "the kernel does not announce changes of interfaces (%s): they are checked every %g s",
+                error,
+                WITHOUT_NEWS_S,
+            )
         if self._config.stun.enabled:
             self._resolver.look_up(self._stun_names)
             self._resolver.start()
@@ -223,7 +227,7 @@ class InterfaceManager:
             time.sleep(ERROR_PAUSE_S)
         except Exception:
             # A sidecar that stops following its interfaces is as bad as a dead one, and harder to notice.
-            log.exception("internal error; the interfaces are looked at again")
+            log.exception("internal error; the interfaces are scanned again")
             self._schedule.failed(time.monotonic())
             time.sleep(ERROR_PAUSE_S)
 
@@ -275,7 +279,7 @@ class InterfaceManager:
             else:
                 keep = now_idle is not None and now_idle.index == managed.interface.index
             if not keep:
-                log.warning("%s: gone, or another device now; its requests take other paths", name)
+                log.warning("%s: removed, or another device now; its requests take other paths", name)
                 with self._lock:
                     del self._managed[name]
                     self._readiness.remove(name)
@@ -343,7 +347,7 @@ class InterfaceManager:
     def _let_late_ones_begin(self) -> None:
         with self._lock:
             for name in self._readiness.after_grace(time.monotonic()):
-                log.warning("%s: no STUN server answers; used without it, as far as probes succeed", name)
+                log.warning("%s: no STUN server answers; the interface is used without STUN where probes succeed", name)
                 self._managed[name].set_ready()
 
     def _warn_when_none(self, choice: InterfaceChoice) -> None:
@@ -352,7 +356,9 @@ class InterfaceManager:
         if none and not self._warned:
             reasons = [f"{interface.name}: {interface.reason}" for interface in choice.skipped]
             reasons += [f"{name}: there is no such interface" for name in choice.missing]
-            log.warning("no interface is in use, nothing can be carried (%s)", "; ".join(reasons) or "there are none")
+            log.warning(
+                "no interface is in use, so no request can be carried (%s)", "; ".join(reasons) or "there are none"
+            )
         self._warned = none
 
     def _number(self, name: InterfaceName) -> _Number | None:

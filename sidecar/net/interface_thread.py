@@ -157,7 +157,7 @@ class InterfaceThread:
             self._turn(readable=readable)
         except Exception:
             # A bug must neither silence the interface permanently nor stay hidden.
-            log.exception("%s: internal error; the interface goes on", self.interface)
+            log.exception("%s: internal error; the interface continues", self.interface)
             self.link.stats.dropped["internal_error"] += 1
             time.sleep(ERROR_PAUSE_S)
         finally:

@@ -144,7 +144,7 @@ def missing_interfaces(
     there = ", ".join(names)
     missing = choose(interfaces, wanted).missing
     lines = [
-        f"{name}: there is no such interface now (there are: {there}); it is used as soon as it comes"
+        f"{name}: there is no such interface now (there are: {there}); it is used as soon as it appears"
         for name in missing
     ]
     return lines + [
@@ -179,7 +179,7 @@ def _virtual_kind(interface: Interface) -> str | None:
     if interface.kind not in _ORDINARY_KINDS:
         return interface.kind
     if any(fnmatch.fnmatchcase(interface.name, pattern) for pattern in _CONTAINER_AND_TUNNEL_NAMES):
-        return "container or tunnel by its name"
+        return "container or tunnel, by its name"
     return None
 
 

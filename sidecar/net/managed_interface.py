@@ -108,7 +108,7 @@ class ManagedInterface:
 
     def _tell_mtu(self, interface: Interface) -> None:
         if 0 < interface.mtu < LEAST_MTU:
-            text = "%s: its MTU of %d is below %d: requests of more than some hundred bytes do not get through"
+            text = "%s: its MTU of %d is below %d: requests of more than a few hundred bytes do not get through"
             log.warning(text, interface.name, interface.mtu, LEAST_MTU)
         self._post(SetMtu(interface.mtu))
 

@@ -62,22 +62,22 @@ class UnmetServices:
 
 def told_unreached(name: str, servers: int) -> str:
     """Return a line about a name of which a robot knows this many servers, and reaches none."""
-    return f"service {name} is offered by {servers} servers that this robot knows of, and it reaches none of them"
+    return f"service {name} is offered by {servers} servers that this robot knows, but it reaches none of them"
 
 
 def told_mismatched(name: str) -> str:
     """Return a line about a name whose server on a cloud's host cannot be called."""
     whose = "a node of this host's ROS domain"
-    return f"service {name} is served by {whose}, with a QoS that does not fit: make it reliable, as it is by default"
+    return f"service {name} is served by {whose}, with an incompatible QoS: make it reliable, which is the default"
 
 
 def told(name: str, offered: Iterable[str], whose: str) -> str:
     """Return a line about a name that is not served; `offered` are the names that are, `whose` says by whom."""
     names = sorted(set(offered))
     if name in names:
-        return f"service {name} is configured and offered, and no server of it is reached, or none of the type it wants"
+        return f"service {name} is configured and offered, but no server of it is reached, or none has the wanted type"
     close = difflib.get_close_matches(name, names, n=1)
     if close:
-        return f"service {name} is configured, and {whose} offers it; did you mean {close[0]}?"
+        return f"service {name} is configured, but {whose} offers it; did you mean {close[0]}?"
     shown = " ".join(names[:MAX_NAMES_SHOWN]) + (f" and {len(names) - MAX_NAMES_SHOWN} more" if names[10:] else "")
-    return f"service {name} is configured, and {whose} offers it; offered: {shown or 'nothing'}"
+    return f"service {name} is configured, but {whose} offers it; offered: {shown or 'nothing'}"

@@ -130,7 +130,7 @@ def test_a_stand_in_for_the_control_plane(world: World, tmp_path: Path, whose: s
     name = f"led-astray-{whose}"
     with world.calls():
         robot = world.system.start_robot([PLAN], name=name, host="robot_2", interfaces=["eth9"], control_plane=target)
-        world.system.wait("the sidecar to refuse", lambda: "going on without it" in robot.log.read_text())
+        world.system.wait("the sidecar to refuse", lambda: "the sidecar continues without it" in robot.log.read_text())
     assert world.counter("robot_2", "plr_control_plane_connected") == 0
     assert "called" not in stand_in.log.read_text()
     assert robot.terminate() == 0

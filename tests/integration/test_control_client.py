@@ -391,7 +391,7 @@ def test_an_unreachable_control_plane_blocks_nobody(target: str, caplog: pytest.
         rig.client.set_candidates(CandidateSet((CANDIDATE,)))
         rig.client.set_services(ServiceSet((), ()))
         wait_for(lambda: rig.client.stats.attempts >= 2)
-        wait_for(lambda: "going on without it" in caplog.text)
+        wait_for(lambda: "the sidecar continues without it" in caplog.text)
         rig.client.stop()
     assert rig.hooks.connection.empty()
     assert "plr-control" not in {thread.name for thread in threading.enumerate()}

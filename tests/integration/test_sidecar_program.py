@@ -170,7 +170,7 @@ def test_an_interface_that_is_missing_is_warned_of(tmp_path: Path) -> None:
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
 def test_runs_without_control_plane_and_stops_cleanly(program: Program, number: signal.Signals) -> None:
     program.start()
-    program.wait_for_log("going on without it")
+    program.wait_for_log("the sidecar continues without it")
     text = program.metrics()
     assert "plr_control_plane_connected 0.0" in text
     checked = subprocess.run(["promtool", "check", "metrics"], input=text, capture_output=True, text=True, timeout=60)
@@ -230,7 +230,7 @@ def test_starts_from_the_disk_while_the_control_plane_is_down_then_registers_wit
     token = remember(program, PEERS, mapping("lo"))
     program.start()
     program.wait_for_log("started from the mapping kept on disk")
-    program.wait_for_log("going on without it")
+    program.wait_for_log("the sidecar continues without it")
     assert "plr_mapping_version 12.0" in program.metrics()
     port = int(str(program.config["control_plane"]).rsplit(":", 1)[1])
     with ScriptedControlPlane(port, welcome=Welcome(3.0, 0.5)) as control_plane:
@@ -269,7 +269,7 @@ def test_a_mapping_on_disk_is_in_force_as_soon_as_it_fits_and_stays_on_the_disk(
         program.wait_for_log("registered with the control plane")
         assert "plr_mapping_version 0.0" in program.metrics()
         control_plane.say(PEERS)
-        program.wait_for_log("mapping version 12 fits now")
+        program.wait_for_log("mapping version 12, which was refused before, is in force now")
         assert "plr_mapping_version 12.0" in program.metrics()
         program.process.send_signal(signal.SIGTERM)
         assert program.end() == 0

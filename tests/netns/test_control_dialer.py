@@ -109,7 +109,7 @@ def test_the_stream_moves_away_from_each_carrier_that_goes_dark(
     call.wait_until_sending()
     wait_for_line(system, robot, REGISTERED, f"over {first}")
     system.lab.link(first).blackhole()
-    wait_for_line(system, robot, f"lost: nothing comes over {first}")
+    wait_for_line(system, robot, f"lost: nothing arrives over {first}")
     wait_for_line(system, robot, REGISTERED, f"over {second}")
     system.lab.link(first).restore()
     system.wait(f"{first} to be back", lambda: path_up(system, first), PATIENCE_S)
@@ -131,7 +131,7 @@ def test_it_goes_back_to_what_is_not_billed(system: System, tmp_path: Path) -> N
     robot = start(system, tmp_path, networks=networks)
     wait_for_line(system, robot, REGISTERED, "over wwan0")
     system.lab.link("wlan0").restore()
-    wait_for_line(system, robot, "opening a new stream: wlan0 is well, and costs less than wwan0")
+    wait_for_line(system, robot, "opening a new control stream: wlan0 works, and costs less than wwan0")
     wait_for_line(system, robot, REGISTERED, "over wlan0")
     assert "control plane lost" not in robot.log.read_text()
 
@@ -153,4 +153,4 @@ def test_an_interface_that_is_pulled_takes_the_stream_away_at_once(
     system.lab.host("robot").link_down(first)
     wait_for_line(system, robot, REGISTERED, f"over {second}")
     system.lab.host("robot").link_up(first)
-    assert f"{first} carries nothing any more" in robot.log.read_text()
+    assert f"{first} no longer carries anything" in robot.log.read_text()

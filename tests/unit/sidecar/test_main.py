@@ -47,5 +47,5 @@ def test_a_deadline_in_seconds_is_doubted(
     )
     monkeypatch.setattr("plr.sidecar.ros.environment.problem", lambda **_: None)
     assert main(["--config", str(config), "--check-config"]) == 0
-    told = "0.2 ms is less than any network takes; the unit is milliseconds"
+    told = "0.2 ms is shorter than the round trip of any network; the unit is milliseconds"
     assert capsys.readouterr().err == f"plr-sidecar: warning: services[1].deadline_ms: {told}\n"

@@ -66,7 +66,7 @@ def test_no_more_is_announced_than_is_taken_and_that_is_logged_once(caplog: pyte
     assert said.candidates == (*candidates(0, 8), *candidates(1, 8))
     announcer.announce([*candidates(0, 21), *candidates(1, 8)])
     assert [record.getMessage() for record in caplog.records] == [
-        "eth0: 12 of its addresses are not announced: peers use few of each"
+        "eth0: 12 of its addresses are not announced: peers use only a few of each interface"
     ]
     many = announcer.announce(one for interface in range(40) for one in candidates(interface, 8))
     assert len(many.candidates) == 256

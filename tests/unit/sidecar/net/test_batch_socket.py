@@ -134,7 +134,7 @@ def test_a_kernel_that_refuses_to_segment_costs_nothing_but_system_calls(
     assert near.stats.offload["send"] is False
     assert not near.stats.dropped
     assert not near.too_big
-    assert caplog.text.count("wlan0: the kernel will not cut datagrams") == 1
+    assert caplog.text.count("wlan0: the kernel does not segment datagrams") == 1
 
 
 def test_datagrams_too_long_for_the_device_are_told_of_and_the_rest_leaves(ends: tuple[End, End]) -> None:

@@ -122,14 +122,14 @@ def test_a_named_interface_that_does_not_exist_is_missing_but_a_glob_may_match_n
 
 def test_what_is_missing_is_told_to_people_with_what_there_is() -> None:
     (line,) = missing_interfaces([WLAN], ["wlan0", "wlan1", "wwan*"])
-    assert line == "wlan1: there is no such interface now (there are: wlan0); it is used as soon as it comes"
+    assert line == "wlan1: there is no such interface now (there are: wlan0); it is used as soon as it appears"
 
 
 @pytest.mark.audit("ops-1")
 def test_what_is_said_of_interfaces_that_are_not_there_is_told_once() -> None:
     lines = missing_interfaces([WLAN], ["wlan0", "wwan0"], ["wlan*", "wwan0", "wwan1", "usb*"])
     assert lines == [
-        "wwan0: there is no such interface now (there are: wlan0); it is used as soon as it comes",
+        "wwan0: there is no such interface now (there are: wlan0); it is used as soon as it appears",
         "networks: wwan1 matches no interface now (there are: wlan0)",
         "networks: usb* matches no interface now (there are: wlan0)",
     ]

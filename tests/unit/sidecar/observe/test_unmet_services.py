@@ -45,7 +45,7 @@ def test_what_known_servers_offer_is_not_unmet_though_none_is_reached() -> None:
     assert unmet.unmet == {WHERE}
     assert unmet.unreached == {PLAN: 2}
     assert told_unreached(PLAN, 2) == (
-        "service /plan is offered by 2 servers that this robot knows of, and it reaches none of them"
+        "service /plan is offered by 2 servers that this robot knows, but it reaches none of them"
     )
     unmet.look({PLAN}, {WHERE: 1}, 30.0)
     assert unmet.unmet == frozenset()
@@ -61,14 +61,14 @@ def test_what_came_a_moment_ago_is_not_blamed() -> None:
 
 def test_a_server_whose_qos_does_not_fit_is_told_with_its_cure() -> None:
     assert told_mismatched(PLAN) == (
-        "service /plan is served by a node of this host's ROS domain, with a QoS that does not fit: make it reliable, "
-        "as it is by default"
+        "service /plan is served by a node of this host's ROS domain, with an incompatible QoS: make it reliable, "
+        "which is the default"
     )
 
 
 def test_the_line_names_what_was_probably_meant_or_what_there_is() -> None:
-    whose = "no server that this robot knows of"
-    start = f"service /where_i_am is configured, and {whose} offers it"
+    whose = "no server that this robot knows"
+    start = f"service /where_i_am is configured, but {whose} offers it"
     assert told(WHERE, ["/plan", "/where_am_i"], whose) == f"{start}; did you mean /where_am_i?"
     assert told(WHERE, [], whose) == f"{start}; offered: nothing"
     assert told(WHERE, ["/b", "/a", "/a"], whose) == f"{start}; offered: /a /b"
@@ -78,6 +78,6 @@ def test_the_line_names_what_was_probably_meant_or_what_there_is() -> None:
 
 def test_a_name_that_is_offered_is_not_called_wrong() -> None:
     """As on a robot with an expired certificate, which knows its servers from the disk."""
-    assert told(WHERE, ["/plan", WHERE], "no server that this robot knows of") == (
-        f"service {WHERE} is configured and offered, and no server of it is reached, or none of the type it wants"
+    assert told(WHERE, ["/plan", WHERE], "no server that this robot knows") == (
+        f"service {WHERE} is configured and offered, but no server of it is reached, or none has the wanted type"
     )
