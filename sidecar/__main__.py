@@ -179,7 +179,7 @@ def _run(config: SidecarConfig) -> int:
         try:
             problem = _certificate_problem(config)
             if problem is not None:
-                # Start all the same: the clock is set soon after a boot, and a replaced certificate is read again.
+                # Start anyway: the clock is set soon after a boot, and a replaced certificate is read again.
                 log.log(logging.WARNING if problem.in_force else logging.ERROR, "%s", problem.text)
             # Imported late, as it takes a second, several on a busy machine: a wrong configuration has been reported by
             # now, and signals are handled meanwhile.

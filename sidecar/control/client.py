@@ -354,7 +354,7 @@ class ControlClient:
     async def _write(self, call: _Call) -> None:
         while True:
             self._wake.clear()
-            # Read before the messages are collected: a stop during the writes below still has its goodbye to send.
+            # Read before the messages are collected: a stop during the writes below must still send its goodbye.
             stopping = self._stopping
             now = time.monotonic()
             self._session.handle_timer(now)

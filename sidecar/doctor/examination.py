@@ -347,7 +347,7 @@ def _ping_all(client: LocalClient, state: dict[str, Any]) -> dict[PathKey, Pinge
             for peer in peers:
                 if time.monotonic() > end:
                     return pings
-                # The sidecar answers MAX_REQUESTS at once, and may take its time over some.
+                # The sidecar answers MAX_REQUESTS at once, and may be slow with some.
                 _listen(client, asked, pings, PING_PATIENCE_S, until=MAX_REQUESTS - 1)
                 asked[client.ping(peer, None, PING_BYTES)] = peer
             last = turn == PINGS - 1

@@ -219,7 +219,7 @@ def _connect(where: Where) -> LocalClient:
         try:
             config = read_config(where)
         except ConfigError:
-            # This user may not read it, or it changed since the start: the usual socket may do.
+            # This user may not read it, or it changed since the start: the default socket may work.
             config = None
     return connect(where, config)
 

@@ -157,7 +157,7 @@ class LocalClient:
         except TimeoutError:
             raise LocalBusyError("the sidecar reads nothing: it is stopped, or very busy") from None
         except OSError as error:
-            # Its last words before it closed tell more.
+            # What it wrote before it closed says more.
             line = self.next_line(CONNECT_S)
             raise LocalError(str(error.strerror)) if line is None else refusal(line) from error
         return self._id

@@ -435,7 +435,7 @@ class LocalServer:
             del client.unread[:sent]
         if client.unread or not client.answers:
             return
-        # Only one piece: those of others, and root's, come in between.
+        # Only one piece: pieces for other users and for root come in between.
         piece = next(client.answers[0], None)
         if piece is None:
             client.answers.popleft()
@@ -449,7 +449,7 @@ class LocalServer:
         if client.closing and not busy and not client.rounds:
             self._drop(client)
             return
-        # A client that does not read is not read from.
+        # Requests of a client that does not read its answers are not read.
         silent = client.closing or client.ended or client.rests_until
         reading = not silent and len(client.unread) < MAX_UNREAD_BYTES
         events = (selectors.EVENT_READ if reading else 0) | (selectors.EVENT_WRITE if busy else 0)

@@ -175,7 +175,7 @@ class InterfaceThread:
         return 0.0 if self._more else due
 
     def _turn(self, *, readable: bool) -> None:
-        # What somebody waits for goes first, what can wait comes after: at a low rate every step runs in cold caches,
+        # Work that somebody waits for comes first, other work after it: at a low rate every step runs in cold caches,
         # for the first time in a long while, and costs several times what it does under load.
         if readable:
             self._receive(at_most=1)

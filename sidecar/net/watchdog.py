@@ -41,7 +41,7 @@ class Watchdog:
         """Look at these threads, which are all there are; return what changed, if anything did."""
         slept, self._looked_at = now - self._looked_at, now
         if slept > HUNG_AFTER_S:
-            return None  # we did not get to run either: the machine stalled, not a driver
+            return None  # this thread did not run either: the machine stalled, not a driver
         before = self._hung
         # On a busy machine a thread may not run for as long; that is not the driver's fault, and ends by itself.
         self._hung = {

@@ -310,7 +310,7 @@ def _alike(walk: Walk, began: int, size: int, lengths: list[int], most: int) -> 
     where = (np.array(lengths)[:, None] - began + np.arange(4)).reshape(-1)
     first = walk.bytes[began : began + size][where]
     alike, chunk = 0, _FIRST_CHUNK
-    # A vain comparison covers no more than about what matched before: hostile bytes must not make this slow.
+    # A failed comparison covers no more than about what matched before: hostile bytes must not make this slow.
     while alike < most:
         chunk = min(chunk, most - alike)
         start = began + size * (alike + 1)

@@ -264,5 +264,5 @@ def _open_lock(folder: OwnFolder) -> int:
     try:
         return folder.open(LOCK_FILE, os.O_RDWR | os.O_CREAT)
     except OSError:
-        # A card that has become read-only still holds the last mapping: the lock of an earlier run will do.
+        # A card that has become read-only still holds the last mapping: the lock of an earlier run is enough.
         return folder.open(LOCK_FILE, os.O_RDONLY)

@@ -139,7 +139,7 @@ class Answers:
         """Return the number of answers to these robots that wait for room and are not on their way to any copy."""
         return sum(len(line.firsts) for robot in robots for line in self._lines.get(robot, ()))
 
-    # -- what comes in --------------------------------------------------------------------------------------------
+    # -- inputs ---------------------------------------------------------------------------------------------------
 
     def send(self, replies: list[Reply], now: float) -> None:
         """Send these replies as soon as there is room."""
@@ -212,7 +212,7 @@ class Answers:
         self._stats.dropped["answer_copies_unsent"] += len(answer.waiting)
         self._remove(answer)
 
-    # -- what goes out --------------------------------------------------------------------------------------------
+    # -- outputs --------------------------------------------------------------------------------------------------
 
     def on_room(self, now: float) -> None:
         """Send what waits for room, as messages have ended."""
@@ -319,7 +319,7 @@ class Answers:
         if not any(map(len, self._lines.get(robot, ()))):
             self._lines.pop(robot, None)
 
-    # -- what ends otherwise --------------------------------------------------------------------------------------
+    # -- other ends -----------------------------------------------------------------------------------------------
 
     def drop(self, robot: NodeName, request_id: RequestId) -> None:
         """Drop what is unsent of the answers to a request that the robot called off."""

@@ -134,7 +134,7 @@ class ControlWays:
         self.can_bind = True
         """Whether the system lets us bind to an interface."""
 
-    # -- what is told ---------------------------------------------------------------------------------------------
+    # -- inputs ---------------------------------------------------------------------------------------------------
 
     def set_interfaces(self, interfaces: Sequence[ControlInterface], now: float) -> None:
         """Replace the interfaces that can carry something now, in order."""
@@ -206,7 +206,7 @@ class ControlWays:
         if state is not None:
             state.well_s = WELL_S
 
-    # -- what is asked --------------------------------------------------------------------------------------------
+    # -- queries --------------------------------------------------------------------------------------------------
 
     @property
     def empty(self) -> bool:
@@ -285,7 +285,7 @@ class ControlWays:
                 found.append((well_at if failure is None else max(well_at, failure.until), way))
         return found
 
-    # -- within ---------------------------------------------------------------------------------------------------
+    # -- internal -------------------------------------------------------------------------------------------------
 
     def _ways(self) -> list[Way]:
         """Return every way; the address and the interface that worked last come first."""

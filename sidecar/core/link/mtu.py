@@ -68,7 +68,7 @@ class LinkMtu:
 
     def lost(self, path: Path, lost: list[Sent], now: float) -> None:
         """Note datagrams that were found lost at once; call it before they are sent again."""
-        # Those longer than the current size left before it fell, and say nothing of what is sent now.
+        # Those longer than the current size left before it fell, and say nothing about what is sent now.
         large = sum(run.within(BASE_BYTES + 1, path.mtu.size) for run in lost)
         if large and path.mtu.on_lost(large, now):
             self._fell(path)

@@ -223,7 +223,7 @@ class PathTable:
             self._forget(path)
         names = {peer.name for peer in peers}
         for buckets in (self._unproven, self._exchanges, self._new_paths):
-            # A peer that leaves and returns at will keeps what was left: only full ones are forgotten.
+            # A peer that leaves and returns keeps its budget as it was: only full budgets are forgotten.
             for name in [name for name, one in buckets.items() if name not in names and one.is_full(now)]:
                 del buckets[name]
         return list(before.values())

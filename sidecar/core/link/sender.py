@@ -139,7 +139,7 @@ class DatagramBuilder:
         if path.introductions:
             self._answer_introductions(path, burst, now)
         if path.state is PathState.DOWN and path.control_at <= now:
-            # What is owed goes before what we ask: both count against what may go to an unproven address.
+            # Answers go before our own questions: both count against what may go to an unproven address.
             self._add_control(path, path.take_control(now), burst, now)
         if probing and path.probe_at <= now:
             self._add_probe(path, burst, now)
@@ -230,7 +230,7 @@ class DatagramBuilder:
                 view[start + FRAGMENT_DATAGRAM_BYTES : plain_end] = data
                 seal_into(view[start + NONCE_OFFSET : body], view[body:plain_end], view[start:body], view[body:end])
         if message.over:
-            return 0  # who ended it meanwhile may count on nothing having left; numbers may be skipped
+            return 0  # whoever ended it meanwhile relies on nothing having left; numbers may be skipped
         del buffer[end:]
         last = end - segment * (count - 1)
         path.recovery.on_run_sent(first_number, count, now, segment, last, message, indices.start)

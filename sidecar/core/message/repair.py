@@ -65,7 +65,7 @@ class LossEstimate:
     @property
     def loss(self) -> Loss:
         """The loss to expect from now on."""
-        # Fewer than a handful of losses tell nothing of bursts.
+        # Fewer than a handful of losses say nothing about bursts.
         dispersion = (self._squares + 5.0) / (self._expected + 5.0)
         return Loss(max(self._fast, self._slow), min(max(dispersion, 1.0), MAX_DISPERSION))
 

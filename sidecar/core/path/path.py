@@ -340,7 +340,7 @@ class Path:
         """Return how many datagrams arrived and were missing since the last call."""
         arrived, missed = self.recovery.total_arrived, self.recovery.reordering.missed
         told_arrived, told_missed = self.reported_fates
-        # More may have turned up late than went missing in the meantime: then the next report has that many fewer.
+        # More may have arrived late than went missing in the meantime: then the next report counts that many fewer.
         self.reported_fates = arrived, max(missed, told_missed)
         return arrived - told_arrived, max(0, missed - told_missed)
 

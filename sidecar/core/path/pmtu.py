@@ -163,7 +163,7 @@ class PathMtu:
         self._target = None
         self._at = now + RAISE_EVERY_S
 
-    # -- what becomes of the data ---------------------------------------------------------------------------------
+    # -- outcomes of data -----------------------------------------------------------------------------------------
 
     def on_delivered(self, size: int) -> None:
         """Note that a datagram of this many bytes was acknowledged or answered."""

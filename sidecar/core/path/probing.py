@@ -101,7 +101,7 @@ class Probing:
         """Probes sent in answer to introductions. They are kept apart, since each repeated introduction makes us send
         one."""
 
-    # -- looking at it -----------------------------------------------------------------------------------------------
+    # -- queries -----------------------------------------------------------------------------------------------------
 
     @property
     def proven_at(self) -> float:

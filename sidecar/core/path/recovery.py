@@ -187,7 +187,7 @@ class Recovery:
         """Return what an acknowledgement covers although it was declared lost."""
         arrived = self.reordering.late(ack.ranges, self.rtt, now)
         if arrived:
-            # Where every answer takes longer than the timeouts, only these tell how long.
+            # Where every answer takes longer than the timeouts, only these show how long.
             self._pto_count = 0
             newest_at = next((run.at for run in arrived if run.end == ack.ranges[0][1] + 1), None)
             if newest_at is not None:

@@ -198,7 +198,7 @@ class RequestTable:
         if request.done:
             self._parts.stats.duplicate_responses += 1
         elif late and request.rule.drop_late:
-            if not request.judged:  # else the one that came in time may be good
+            if not request.judged:  # otherwise the one that came in time may be good
                 self._drop_late(request, copy, answer)
         else:
             self._offer(request, copy, answer, response.payload, late=late)

@@ -98,7 +98,7 @@ class LocalServer:
         went = bool(self._asked) and not self._asked & (alive or self.endpoints)
         if went or alive:
             self._asked = alive
-        # Once true, it stays: rmw briefly says no again whenever another node begins to serve the name.
+        # Once true, it stays true: rmw briefly reports false again whenever another node begins to serve the name.
         self._matched = self._matched or bool(self._client.handle.service_server_is_available())
         self.ready = self._matched and self.is_usable(now)
         return went

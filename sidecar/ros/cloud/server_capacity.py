@@ -228,7 +228,7 @@ class ServerCapacity:
             else:
                 self._set_limit(wanted)
         elif at_least > out + KEEPS_PACE and self._is_stale(now):
-            self._calibrate_afresh()  # more than were there: what a request alone takes became less
+            self._calibrate_afresh()  # more than were there: a request alone now takes less
         elif out > self._limit - 1:
             more = self._limit + 1 if self._fell_behind else 2 * self._limit
             self._set_limit(min(more, self._most))

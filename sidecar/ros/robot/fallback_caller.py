@@ -154,7 +154,7 @@ class FallbackCaller:
         """Return the services whose fallback can be called, or is likely to come back, with their types."""
         return {service: kind for service, (kind, _) in self._types.items()}
 
-    # -- what becomes of requests ----------------------------------------------------------------------------------
+    # -- outcomes of requests --------------------------------------------------------------------------------------
 
     def submitted(self, request_id: RequestId, service: ServiceName, payload: bytes, now: float) -> None:
         """Note that a request goes to the network."""

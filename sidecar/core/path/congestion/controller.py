@@ -134,7 +134,7 @@ class CongestionController:
         self._round_min_rtt = float("inf")
         self._round_max_rtt = 0.0
 
-    # -- asking ---------------------------------------------------------------------------------------------------
+    # -- queries --------------------------------------------------------------------------------------------------
 
     def budget(self, now: float, in_flight: int) -> int:
         """Return the bytes that may leave now: 0, or at least one datagram."""
@@ -211,7 +211,7 @@ class CongestionController:
             return rate
         return self._search.gain * rate
 
-    # -- being told -----------------------------------------------------------------------------------------------
+    # -- inputs ---------------------------------------------------------------------------------------------------
 
     def on_sent(self, now: float, size: int, in_flight: int) -> None:
         """Note that these bytes left; `in_flight` includes them."""
@@ -272,8 +272,8 @@ class CongestionController:
         """Take a loss of these bytes, the newest of them sent at `sent_at`; `in_flight` is what is left."""
         rtt = self._rtt
         if rtt is None or sent_at <= self._collapsed_at:
-            return  # the restart at the minimum answered that loss, which says nothing of what is sent since
-        # What start-up overflows fills in one round: nothing stands yet.
+            return  # the restart at the minimum answered that loss, which says nothing about what was sent since
+        # The queue that start-up overflows fills in one round: no queue stands yet.
         queued = self.phase is Phase.STARTUP and self._stands(self._round_max_rtt, rtt)
         queued = queued or self.ceiling.meets_queue(rtt)
         if self.policer.on_lost(lost_bytes, sent_at, rtt.smoothed, now, queued=queued):

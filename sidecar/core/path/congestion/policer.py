@@ -161,7 +161,7 @@ class Policer:
         self._round_at = 0.0
         self._rtt_s = 0.0
 
-    # -- asking ---------------------------------------------------------------------------------------------------
+    # -- queries --------------------------------------------------------------------------------------------------
 
     @property
     def rate(self) -> float | None:
@@ -176,7 +176,7 @@ class Policer:
     def _unit_s(self) -> float:
         return max(UNIT_S, UNIT_ROUNDS * self._rtt_s, UNIT_BYTES / self._token_rate)
 
-    # -- being told -----------------------------------------------------------------------------------------------
+    # -- inputs ---------------------------------------------------------------------------------------------------
 
     def ran_dry(self) -> None:
         """Note that nothing waits to be sent."""

@@ -105,7 +105,7 @@ class Adaptive:
             patience_s += answer_s
         elif copy.arrived:
             sending_s = max(copy.progress_at - copy.sent_at - rtt_s, LEAST_STEP_S) * message.count / copy.arrived
-            # The first symbols tell little: an idle path starts slowly.
+            # The first symbols show little: an idle path starts slowly.
             believed = min(1.0, (now - copy.sent_at) / copy.forecast_s)
             sending_s = believed * sending_s + (1.0 - believed) * max(copy.forecast_s - answer_s, 0.0)
             left_s = sending_s * (1.0 - copy.arrived / message.count) + answer_s

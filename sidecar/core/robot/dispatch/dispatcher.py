@@ -144,7 +144,7 @@ class Dispatching:
         if request.is_answered or (waiting and not request.rule.redundancy.helps):
             return
         if rejected and len(request.copies) >= MAX_COPIES:
-            return  # its retry goes on asking, without haste
+            return  # its retry keeps asking, at a slower pace
         alive = any(routes.state(copy.path) is not PathState.DOWN for copy in waiting)
         if alive and not insist and MODES[request.rule.redundancy].watches(self, request, now):
             return

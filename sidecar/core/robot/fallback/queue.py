@@ -125,7 +125,7 @@ class FallbackQueue:
         lead_s = self._lead_s()
         if not self.rule.in_time or not self.planned or lead_s is None:
             return None
-        # Requests that are wanted already run first, whatever is added behind them. More than fit into one deadline
+        # Requests that are already wanted run first, whatever is added behind them. More than fit into one deadline
         # cannot all be in time, however soon the first begins.
         fit = int((1 - SPARE) * self.deadline_s / lead_s)
         ahead = enumerate(islice(self.planned.values(), min(fit, PLANNED_AHEAD)), 1)
