@@ -322,7 +322,7 @@ class LocalServer:
         if client.closing or client.rests_until:
             return
         if len(client.received) > MAX_REQUEST_BYTES:
-            self._refuse_for_good(client, f"a request is a line of at most {MAX_REQUEST_BYTES} bytes")
+            self._refuse_and_close(client, f"a request is a line of at most {MAX_REQUEST_BYTES} bytes")
         elif client.ended:
             client.closing = True
             if client.received:
@@ -335,7 +335,7 @@ class LocalServer:
         try:
             request = decode_request(line)
         except DecodeError as error:
-            self._refuse_for_good(client, str(error))
+            self._refuse_and_close(client, str(error))
             return
         now = time.monotonic()
         if len(client.answers) + len(client.rounds) >= MAX_REQUESTS or request.id in client.rounds:
@@ -355,7 +355,7 @@ class LocalServer:
         client.unread += encode_error(request, "too many requests: wait a second", busy=True)
         client.rests_until = time.monotonic() + REST_S
 
-    def _refuse_for_good(self, client: _Client, text: str) -> None:
+    def _refuse_and_close(self, client: _Client, text: str) -> None:
         self.refused["bad_request"] += 1
         client.received.clear()
         client.answers.clear()

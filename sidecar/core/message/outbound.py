@@ -152,7 +152,7 @@ class OutboundMessage:
         """Length of its longest datagram, with the room for the tag."""
         return min(self.total, self.symbol) + FRAGMENT_OVERHEAD_BYTES
 
-    def cut_anew(self, number: int, path: PathId, symbol: int) -> OutboundMessage:
+    def cut_again(self, number: int, path: PathId, symbol: int) -> OutboundMessage:
         """Return the same bytes as another message, for paths that carry at most `symbol` bytes at once.
 
         Its symbols do not complete those of this one at the receiver.

@@ -173,7 +173,7 @@ class Outbox:
         self._stats.dropped["message_forgotten"] += 1
         self._remove(message)
         if message.generation < MAX_GENERATIONS:
-            self._enter_anew(message, self._routes.best_to(peer) or message.path)
+            self._enter_again(message, self._routes.best_to(peer) or message.path)
 
     def drop(self, message: OutboundMessage) -> None:
         """Stop sending a message, in whatever it was cut into, and tell a peer that has some of it."""
@@ -239,7 +239,7 @@ class Outbox:
 
     def _resend(self, message: OutboundMessage, path: PathId, indices: tuple[int, ...]) -> None:
         if message.datagram_bytes > self._routes.max_datagram(path):
-            self._cut_anew(message, path)
+            self._cut_again(message, path)
             return
         message.interfaces.add(path.interface)
         self._command(Resend(path, message, indices))
@@ -251,13 +251,13 @@ class Outbox:
         message.copied(indices)
         self._command(Resend(path, message, indices))
 
-    def _cut_anew(self, message: OutboundMessage, path: PathId) -> None:
+    def _cut_again(self, message: OutboundMessage, path: PathId) -> None:
         """Send the whole message again in smaller symbols: no path carries its present ones any more."""
         self.drop(message)
-        self._enter_anew(message, path)
+        self._enter_again(message, path)
 
-    def _enter_anew(self, message: OutboundMessage, path: PathId) -> None:
-        self._enter(message.cut_anew(self._take_number(), path, self._routes.symbol_to(path.peer)))
+    def _enter_again(self, message: OutboundMessage, path: PathId) -> None:
+        self._enter(message.cut_again(self._take_number(), path, self._routes.symbol_to(path.peer)))
 
     def on_path_up(self, path: PathId) -> list[Step]:
         """Return the steps that send all that waited for a path to this peer."""

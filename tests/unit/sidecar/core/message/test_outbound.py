@@ -102,8 +102,8 @@ def test_with_its_only_path_gone_everything_uncovered_travels_again() -> None:
     assert outbound.lost(outbound.missing()) == tuple(range(1, 9))
 
 
-def test_cut_anew_it_keeps_its_share_of_repairs() -> None:
+def test_cut_again_it_keeps_its_share_of_repairs() -> None:
     outbound = coded(10, 2)
-    successor = outbound.cut_anew(2, path(), 500)
+    successor = outbound.cut_again(2, path(), 500)
     assert (successor.count, successor.repairs) == (20, 4)
     assert outbound.newest is successor

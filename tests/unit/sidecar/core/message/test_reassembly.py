@@ -78,7 +78,7 @@ def test_symbols_in_any_order_with_duplicates_give_the_message_once(reassembler:
     assert reassembler.held_bytes == 0
 
 
-def test_a_batch_is_told_of_each_message_once(reassembler: Reassembler) -> None:
+def test_a_batch_hears_of_each_message_once(reassembler: Reassembler) -> None:
     one, two = random.Random(1).randbytes(600), random.Random(2).randbytes(700)
     batch = [fragment for pair in zip(symbols(1, one), symbols(2, two), strict=True) for fragment in pair]
     results = reassembler.add([*batch, *batch, symbols(3, bytes(600))[0]], 1.0)

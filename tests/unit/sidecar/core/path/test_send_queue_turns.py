@@ -95,10 +95,10 @@ def test_what_has_to_wait_is_not_expected_any_more() -> None:
     assert covered_until(Turn(one)) is None
 
 
-def test_what_was_cut_anew_is_no_rival_of_what_it_became() -> None:
+def test_what_was_cut_again_is_no_rival_of_what_it_became() -> None:
     one, other = copies()
     one.expected_at = 0.1
-    successor = one.cut_anew(3, one.path, 1000)
+    successor = one.cut_again(3, one.path, 1000)
     assert covered_until(Turn(successor)) is None
     other.expected_at = 0.1
     assert covered_until(Turn(successor)) is not None

@@ -314,7 +314,7 @@ def test_lost_symbols_take_the_path_that_carries_them() -> None:
     assert box.commands == [Resend(OVER_WLAN, message, (0,)), Resend(OVER_WLAN, message, (1,))]
 
 
-def test_a_message_that_no_path_carries_any_more_is_cut_anew() -> None:
+def test_a_message_that_no_path_carries_any_more_is_cut_again() -> None:
     box = Box(OVER_WLAN)
     carries(box, OVER_WLAN, 1472)
     message = box.send(size=3000)
@@ -323,20 +323,20 @@ def test_a_message_that_no_path_carries_any_more_is_cut_anew() -> None:
     box.routes.set_state(OVER_WLAN, PathState.DOWN)
     box.lost(message, 1)
     (command,) = box.commands
-    anew = message.newest
-    assert command == Send(OVER_WWAN, anew)
+    recut = message.newest
+    assert command == Send(OVER_WWAN, recut)
     assert message.over
-    assert anew.number > message.number
-    assert anew.datagram_bytes == BASE_BYTES
-    assert len(anew.missing()) == anew.count
-    assert b"".join(anew.symbol_data(index) for index in range(anew.count)) == bytes(3000)
+    assert recut.number > message.number
+    assert recut.datagram_bytes == BASE_BYTES
+    assert len(recut.missing()) == recut.count
+    assert b"".join(recut.symbol_data(index) for index in range(recut.count)) == bytes(3000)
     assert (len(box.outbox), box.outbox.held_bytes) == (1, 3000)
     # Who still holds the first one means the bytes.
     box.lost(message, 2)
     box.outbox.drop(message)
-    assert anew.over
+    assert recut.over
     assert (len(box.outbox), box.outbox.held_bytes) == (0, 0)
-    assert box.commands[1:] == [SendAbandon(OVER_WWAN, anew.number)]
+    assert box.commands[1:] == [SendAbandon(OVER_WWAN, recut.number)]
 
 
 def test_what_waits_for_a_path_is_cut_to_the_one_that_comes() -> None:
@@ -385,7 +385,7 @@ def test_nothing_is_said_of_messages_that_did_not_leave_or_that_one_datagram_hol
     assert len(box.outbox) == 0
 
 
-def test_a_forgotten_message_is_sent_anew_but_not_for_ever() -> None:
+def test_a_forgotten_message_is_sent_again_but_not_for_ever() -> None:
     box = Box(OVER_WLAN)
     first = message = box.send(size=3000)
     message.acked[0] = message.acked[1] = 1
