@@ -153,7 +153,7 @@ def test_a_stranger_gets_no_answer(world: World, victim: str) -> None:
 
 
 def test_replayed_into_a_new_session(world: World) -> None:
-    """Everything a run sent, its introductions too, played again to its peer after it has started anew."""
+    """Everything a run sent, its introductions too, played again to its peer after its restart."""
     tap = world.tap("cloud_a")
     before_restart = world.system.parts["robot.sidecar"]
     with world.calls():

@@ -156,7 +156,7 @@ def test_a_robot_whose_keys_have_changed_comes_back_after_the_flood(*, proven: b
 
 
 def test_a_forgotten_session_is_refused_and_a_newer_one_is_not() -> None:
-    """Whoever fills its own share loses its own old sessions: one of them that comes back is not begun anew."""
+    """Whoever fills its own share loses its own old sessions: one of them that comes back does not start over."""
     mesh = Mesh(1)
     mesh.robot("wlan0")
     evil, cloud = mesh.add("evil", Role.ROBOT, ["wlan0"], (rule(),)), mesh.cloud("cloud-a")

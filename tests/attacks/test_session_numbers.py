@@ -23,7 +23,7 @@ CALLS = 20
 
 @pytest.mark.audit("sec-4")
 def test_a_living_robot_keeps_its_session_though_another_registered_with_its_number() -> None:
-    """Before: the living paths were dropped, 0 of 20 answered, once the control plane had started anew."""
+    """Before: the living paths were dropped, 0 of 20 answered, once the control plane had restarted."""
     mesh = Mesh(1)
     robot, evil, cloud = mesh.robot("wlan0"), mesh.add("evil", Role.ROBOT, ["wlan0"], (rule(),)), mesh.cloud("cloud-a")
     mesh.push_views()

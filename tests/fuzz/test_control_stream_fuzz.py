@@ -169,7 +169,7 @@ def test_a_member_that_sends_anything(fleet: Fleet, fuzz_datagrams: int) -> None
     assert codes <= REFUSALS
     assert grpc.StatusCode.INVALID_ARGUMENT in codes
     told = [line for line in fleet.plane.lines if " ended: " in line]
-    assert len(told) <= LINES + time.monotonic() - began, "a member can not fill the disk with log lines"
+    assert len(told) <= LINES + time.monotonic() - began, "a member cannot fill the disk with log lines"
     assert fleet.resident() - before < GROWTH_BYTES
     fleet.assert_fine()
 

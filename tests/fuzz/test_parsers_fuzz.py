@@ -74,7 +74,7 @@ def damaged(good: bytes, rng: random.Random) -> bytes:
 
 
 def feed(count: int, make: Callable[[random.Random], bytes], parse: Callable[[bytes], bool]) -> int:
-    """Returns how many were taken for good ones."""
+    """Return how many were accepted."""
     rng = random.Random(1)
     taken, grown = 0, []
     for _ in range(ROUNDS):

@@ -1,4 +1,4 @@
-"""Another certificate or revocation list: everybody is judged anew, in turns of the loop."""
+"""Another certificate or revocation list: everybody is judged again, in turns of the loop."""
 
 from __future__ import annotations
 
@@ -113,7 +113,7 @@ def test_a_change_amid_the_turns_of_another_loses_nothing(tmp_path: Path) -> Non
 
 
 @pytest.mark.audit("ops-12")
-def test_files_that_are_not_taken_are_told_of_until_they_are_mended(tmp_path: Path) -> None:
+def test_files_that_are_not_taken_are_reported_until_they_are_corrected(tmp_path: Path) -> None:
     """The control plane goes on with those of before: only its next start would show it."""
     metrics = Metrics()
 

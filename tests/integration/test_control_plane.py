@@ -1,4 +1,4 @@
-"""Sidecars come, are told of each other, and go: a real control plane over real gRPC."""
+"""Sidecars come, learn of each other, and go: a real control plane over real gRPC."""
 
 from __future__ import annotations
 
@@ -150,6 +150,6 @@ def test_a_sidecar_that_holds_more_than_the_clock_gives_is_outgrown(plane: Contr
 
 
 @pytest.mark.audit("ops-17")
-def test_a_sidecar_that_holds_what_no_control_plane_gave_out_begins_anew(plane: ControlPlaneProcess) -> None:
+def test_a_sidecar_that_holds_what_no_control_plane_gave_out_starts_over(plane: ControlPlaneProcess) -> None:
     with cloud(plane.address, "cloud-far", held=1 << 62) as c:
         assert c.expect(PeerSet).version < MAX_LIFTED

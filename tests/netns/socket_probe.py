@@ -240,7 +240,7 @@ _PR_SET_NO_NEW_PRIVS, _PR_SET_SECCOMP, _SECCOMP_MODE_FILTER = 38, 22, 2
 
 
 def forbid(numbers: dict[str, int], arguments: tuple[int, ...], error: int) -> None:
-    """Make one system call with these last checked arguments fail with `error` in this process, for good."""
+    """Make one system call with these last checked arguments fail with `error` in this process, permanently."""
     checks = [(0, numbers[platform.machine()])]
     first = 1 if len(arguments) == 2 else 0
     checks += [(16 + 8 * (first + index), value) for index, value in enumerate(arguments)]

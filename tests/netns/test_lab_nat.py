@@ -90,7 +90,7 @@ def test_rebinding_one_router_leaves_the_other_alone(lab: Lab) -> None:
         assert sender.recv(100) == b"response"
 
 
-def test_symmetric_router_maps_every_destination_anew() -> None:
+def test_symmetric_router_maps_every_destination_separately() -> None:
     robot = HostSpec("robot", (InterfaceSpec("wwan0", emulated=False, nat=NatSpec("symmetric")),))
     with Lab(LabConfig(robots=(robot,))) as lab:
         clouds = [lab.host(name) for name in ("cloud_a", "cloud_b", "control")]

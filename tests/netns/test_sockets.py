@@ -86,7 +86,7 @@ def test_datagrams_are_not_fragmented() -> None:
     assert seen == {"4": errno.EMSGSIZE, "6": errno.EMSGSIZE}
 
 
-def test_runs_are_cut_by_the_kernel_and_what_is_too_long_in_them_is_told_of() -> None:
+def test_runs_are_cut_by_the_kernel_and_what_is_too_long_in_them_is_reported() -> None:
     if shutil.which("ethtool") is None:
         pytest.skip("ethtool is not installed")
     seen, log = probe("runs")

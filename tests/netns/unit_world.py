@@ -195,7 +195,7 @@ def main(folder: Path) -> dict[str, Any]:
         if all(program["ready"] for program in seen.values()):
             wait_for_metrics(seen, lambda: works(seen))
             renew_certificates(folder, authority)
-            # The sidecar connects anew with the renewed one: until then it is not connected for a moment.
+            # The sidecar connects again with the renewed one: until then it is not connected for a moment.
             wait_for_metrics(seen, lambda: works(seen) and renewal_taken_up(seen))
         for name in reversed(PROGRAMS):
             process, notify = running[name]

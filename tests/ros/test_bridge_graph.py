@@ -116,7 +116,7 @@ def test_servers_whose_nodes_share_a_name_are_all_carried(mesh: Mesh, caplog: py
 
 
 @pytest.mark.audit("dp-16")
-def test_two_servers_of_a_service_are_told_of_though_their_nodes_share_a_name(
+def test_two_servers_of_a_service_are_reported_though_their_nodes_share_a_name(
     mesh: Mesh, caplog: pytest.LogCaptureFixture
 ) -> None:
     caplog.set_level(logging.WARNING, "plr.sidecar")

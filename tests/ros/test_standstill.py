@@ -68,8 +68,8 @@ def come_back(
 ) -> None:
     """Start a program that serves it, stop it until its lease is over, let it go on, and wait until rmw sees it again.
 
-    Fast DDS loses many for good, or half of their endpoints, that had started a second before (also plain servers, and
-    with its lease of 20 s). One that shows nothing is lost, and another one is started.
+    Fast DDS permanently loses many that had started a second before, or half of their endpoints (also plain servers,
+    and with its lease of 20 s). One that shows nothing is lost, and another one is started.
     """
     for _ in range(TRIES):
         program = start()

@@ -120,14 +120,14 @@ class Chaos:
         known = self.world.sidecars.get(NodeName(name))
         if known is not None and known.stream is not None and not restart:
             return
-        anew = known is None or restart or self.rng.random() < 0.5
-        if anew:
+        fresh = known is None or restart or self.rng.random() < 0.5
+        if fresh:
             self.incarnations[name] = self.incarnations.get(name, 0) + 1
         said = registration(name, role, incarnation=self.incarnations[name])
         session = SessionId(zlib.crc32(name.encode()) << 20 | self.incarnations[name])
         said = dataclasses.replace(said, session=session, region=self.rng.choice(["", "eu", "us"]))
         if known is not None:
-            lost_disk = anew and self.rng.random() < 0.3
+            lost_disk = fresh and self.rng.random() < 0.3
             if lost_disk:
                 known.peers_version = known.mapping_version = Version(0)
             said = dataclasses.replace(said, peers_version=known.peers_version, mapping_version=known.mapping_version)

@@ -1,4 +1,4 @@
-"""A cloud whose answers can not be delivered, faster than the honest one: no request is lost by it."""
+"""A cloud whose answers cannot be delivered, faster than the honest one: no request is lost by it."""
 
 from __future__ import annotations
 

@@ -134,7 +134,7 @@ def test_no_event_keeps_the_engine_busy_for_long(calls: Calls, redundancy: Redun
         assert calls.most <= MAX_CALLS, f"{event}: {calls.most} calls in one {calls.where}"
         calls.most = 0
     failed = [event for event in world.robot.events if isinstance(event, RequestFailed)]
-    assert len(failed) == REQUESTS, "each is told of its end"
+    assert len(failed) == REQUESTS, "each learns of its end"
     assert world.robot.engine.stats.in_flight == 0
 
 

@@ -1,4 +1,4 @@
-"""A member introduces another one to a third party: what it was told of that one is of no use there."""
+"""A member introduces another one to a third party: what it was told about that one is of no use there."""
 
 from __future__ import annotations
 

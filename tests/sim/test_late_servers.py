@@ -56,7 +56,7 @@ def test_requests_of_a_time_without_servers_are_answered_by_the_first_that_comes
 
 
 @pytest.mark.parametrize("mode", RedundancyMode)
-@pytest.mark.parametrize("successor", ["another", "the same anew"])
+@pytest.mark.parametrize("successor", ["another", "the same again"])
 def test_what_the_only_server_had_when_its_process_ended_runs_on_the_next_one(
     mode: RedundancyMode, successor: str
 ) -> None:

@@ -16,14 +16,14 @@ def unfinished(node: Node) -> int:
     return sum(len(reassembler) for reassembler in node.engine._inbound._reassemblers.values())
 
 
-def test_a_message_that_the_receiver_forgot_in_an_outage_is_sent_anew() -> None:
+def test_a_message_that_the_receiver_forgot_in_an_outage_is_sent_again() -> None:
     mesh = Mesh(1)
     robot = mesh.robot("wlan0", rules=(rule(lifetime_s=120.0),))
     cloud = mesh.cloud("cloud-a")
     wires = mesh.both_ways("robot.wlan0", "cloud-a.eth0")
     wires[0].bytes_per_s = BYTES_PER_S
     for wire in wires:
-        wire.mtu = BASE_BYTES + HEADERS_V4  # else it would be cut anew for its size
+        wire.mtu = BASE_BYTES + HEADERS_V4  # else it would be cut again for its size
     mesh.push_views()
     mesh.run(1.0)
     robot.submit(bytes(SIZE))

@@ -105,7 +105,7 @@ def test_two_paths_of_different_mtu_to_one_peer_complete_each_other() -> None:
     assert_at_most_once(*clouds)
 
 
-def test_what_was_cut_for_a_path_that_dies_is_cut_anew_for_the_one_that_takes_over() -> None:
+def test_what_was_cut_for_a_path_that_dies_is_cut_again_for_the_one_that_takes_over() -> None:
     mesh, robot, clouds = two_paths(6, {"wlan0": 1500, "wwan0": 1280}, "cloud-a")
     cut(mesh, "wwan0")
     mesh.run(5.0)

@@ -1,4 +1,4 @@
-"""A copy that was refused stays refused, also cut anew: its request may be running elsewhere by then."""
+"""A copy that was refused stays refused, also when it is cut again: its request may be running elsewhere by then."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ from tests.support.mesh import Mesh, rule
 
 @pytest.mark.audit("dp-14")
 @pytest.mark.parametrize("light_after_s", [0.6, 0.8, 2.0])
-def test_a_refused_copy_that_is_cut_anew_does_not_run_beside_the_rescue(light_after_s: float) -> None:
+def test_a_refused_copy_that_is_cut_again_does_not_run_beside_the_rescue(light_after_s: float) -> None:
     """The request gets to a server that is just being restarted, over a path that dies before it can say so.
 
-    Then another path comes that carries shorter datagrams only: the robot cuts the request anew, the refusal crosses
+    Then another path comes that carries shorter datagrams only: the robot cuts the request again, the refusal crosses
     it on its way, and the server is back.
     """
     mesh = Mesh(1)

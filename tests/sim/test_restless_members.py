@@ -16,7 +16,7 @@ from tests.support.samples import candidate, interfaces, offer, registration
 pytestmark = pytest.mark.audit("sec-5")
 
 
-def test_who_flaps_is_told_of_every_few_seconds_and_at_last_as_it_is() -> None:
+def test_who_flaps_is_announced_every_few_seconds_and_at_last_as_it_is() -> None:
     world = World(Settings(warm_up_s=0.0))
     rogue, honest = (world.join(registration(name, Role.CLOUD)) for name in ("rogue", "honest"))
     for cloud in (rogue, honest):
@@ -39,7 +39,7 @@ def test_who_flaps_is_told_of_every_few_seconds_and_at_last_as_it_is() -> None:
     assert ports[NodeName("rogue")] == 5000 + 20 * 40 - 1
 
 
-def test_who_registers_again_and_again_is_told_of_once_a_second() -> None:
+def test_who_registers_again_and_again_is_announced_once_a_second() -> None:
     world = World(Settings(warm_up_s=0.0))
     rogue = world.join(registration("rogue", Role.CLOUD))
     world.say(rogue, CandidateSet(interfaces("eth0")))
@@ -64,8 +64,8 @@ def many_offers(change: int) -> ServiceSet:
     return ServiceSet(tuple(offer(f"/s{number:04}{'x' * 240}", capacity=1 + change) for number in range(1024)))
 
 
-def told_of(robot: SimSidecar, name: str) -> int:
-    """How many bytes of names it was told of a member's offers."""
+def heard_bytes(robot: SimSidecar, name: str) -> int:
+    """Return how many bytes of names it heard of a member's offers."""
     sets = [message for message in robot.received if isinstance(message, PeerSet)]
     return sum(
         len(one.name) + len(one.type)
@@ -81,7 +81,7 @@ def budget(seconds: float) -> float:
     return BYTES_BURST + 600_000 + BYTES_PER_S * seconds
 
 
-def test_who_changes_a_long_list_all_the_time_costs_the_others_little_and_is_told_of_as_it_is_at_last() -> None:
+def test_who_changes_a_long_list_all_the_time_costs_the_others_little_and_is_announced_as_it_is_at_last() -> None:
     world = World(Settings(warm_up_s=0.0))
     rogue = world.join(registration("rogue", Role.CLOUD))
     world.say(rogue, CandidateSet(interfaces("eth0")))
@@ -89,7 +89,7 @@ def test_who_changes_a_long_list_all_the_time_costs_the_others_little_and_is_tol
     for change in range(60):
         world.say(rogue, many_offers(change))
         world.run(1.0)
-    assert told_of(robot, "rogue") <= budget(60.0)
+    assert heard_bytes(robot, "rogue") <= budget(60.0)
     honest = world.cloud("honest")
     world.run(0.5)
     world.say(honest, CandidateSet((candidate("eth0", port=4444),)))
@@ -122,7 +122,7 @@ def test_who_comes_and_goes_with_a_long_list_costs_the_others_no_more() -> None:
         if turn % 3 == 0:
             world.run(0.1)
             world.say(rogue, Drain())
-    assert told_of(robot, "rogue") <= budget(930.0)
+    assert heard_bytes(robot, "rogue") <= budget(930.0)
 
 
 def test_what_a_robot_says_that_it_serves_is_told_to_nobody() -> None:

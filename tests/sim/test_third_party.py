@@ -235,7 +235,7 @@ def test_a_member_that_announces_addresses_of_others_gets_few_bytes_there(addres
     assert 0 < received.bytes <= len(robot.links) * (UNPROVEN_BYTES + 30 * UNPROVEN_BYTES_PER_S)
     before = received.bytes
     for _ in range(10):
-        mesh.push_views()  # again and again: no reason to begin anew
+        mesh.push_views()  # again and again: no reason to start over
         mesh.run(6.0)
     assert received.bytes - before <= len(robot.links) * 61 * UNPROVEN_BYTES_PER_S
     robot.submit(b"honest")

@@ -124,7 +124,7 @@ def test_copies_over_several_paths_say_the_same() -> None:
 
 
 @pytest.mark.audit("dp-5")
-def test_what_is_cut_anew_into_smaller_symbols_says_what_is_left_by_then() -> None:
+def test_what_is_cut_again_into_smaller_symbols_says_what_is_left_by_then() -> None:
     told = Told("wlan0", "wwan0")
     told.mesh.run(20.0)  # both paths carry more than the least by now
     narrow = told.mesh.all_wires_of("robot.wwan0")

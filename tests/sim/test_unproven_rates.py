@@ -42,7 +42,7 @@ def test_after_a_fall_the_modem_holds_no_more_than_on_an_unknown_path(
     before: float, after: float, seconds: float
 ) -> None:
     world = unconfirmed(before * MBIT, after * MBIT, seconds)
-    assert world.control.rate.best > 0.8 * before * MBIT, "nothing told of the fall"
+    assert world.control.rate.best > 0.8 * before * MBIT, "nothing showed the fall"
     took, others = large(world, 8.0)
     assert world.up.longest_wait_s < 1.1 * max(INITIAL_WINDOW_BYTES, UNPROVEN_S * before * MBIT) / (after * MBIT)
     assert others[len(others) // 2] < 0.15

@@ -79,7 +79,7 @@ class Node:
         self.server_delay: Callable[[], float | None] = lambda: 0.001
         self.answer: Callable[[bytes], bytes] = b"echo:".__add__
         self.judge: Callable[[bytes], str | None] = lambda _answer: None
-        """Why an answer can not be delivered, or None."""
+        """Why an answer cannot be delivered, or None."""
         self.server: Callable[[ApplicationEvent], None] | None = None
         """Runs this cloud's requests in place of `server_delay` and `answer`."""
         self.events: list[ApplicationEvent] = []

@@ -1,7 +1,7 @@
 """The values of docs/develop/protocol-vectors.json, with our code and with one written from protocol.md alone.
 
 What is called `independent` here uses nothing of ours: X25519, ECDSA and the two AEADs of `cryptography`, HMAC and
-SHA-256 of the standard library. Where the page is wrong or silent, it can not be right.
+SHA-256 of the standard library. Where the page is wrong or silent, it cannot be right.
 """
 
 from __future__ import annotations

@@ -110,7 +110,7 @@ def test_missed_steps_are_passed_over() -> None:
     assert given_out(Replay(STEPS, start=0.0), 10.0) == [(2.5, 2.5)]
 
 
-def test_repeated_trace_begins_anew_after_its_duration() -> None:
+def test_repeated_trace_starts_over_after_its_duration() -> None:
     replay = Replay(STEPS, start=0.0, repeat_s=4.0)
     assert given_out(replay, 3.0) == [(2.5, 2.5)]
     assert replay.next_change() == 4.0

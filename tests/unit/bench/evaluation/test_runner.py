@@ -51,7 +51,7 @@ def test_what_cannot_be_read_ends_in_one_line(
     assert error.count("\n") == 1
 
 
-def test_a_run_that_is_resumed_makes_anew_what_is_void_or_not_there(tmp_path: Path) -> None:
+def test_a_run_that_is_resumed_repeats_what_is_void_or_missing(tmp_path: Path) -> None:
     parser = argparse.ArgumentParser()
     command.add_arguments(parser)
     common = ["--seconds", "5", "--scenario", "drive-1", "--out", str(tmp_path), "--no-report"]

@@ -95,7 +95,7 @@ def test_who_lacks_a_revocation_is_seen() -> None:
 
 
 @pytest.mark.audit("ops-12")
-def test_what_one_member_claims_of_revocation_lists_is_told_of_that_member_alone() -> None:
+def test_what_one_member_claims_of_revocation_lists_is_shown_for_that_member_alone() -> None:
     def holds(name: str, number: int, ca: int = 5) -> SidecarStatus:
         peer = Peer(NodeName(name), Role.ROBOT, SessionId(1), b"", 1)
         return SidecarStatus(peer, True, 1.0, "", revocations=RevocationSet((HeldList(ca, number, 1000),)))

@@ -96,7 +96,7 @@ def test_whose_network_an_interface_uses_is_told_by_the_robot_or_by_the_interfac
     ]
 
 
-def test_an_interface_that_carries_nothing_is_told_of_and_its_paths_are_not() -> None:
+def test_an_interface_that_carries_nothing_is_reported_and_its_paths_are_not() -> None:
     world = World(Settings(warm_up_s=0.0))
     world.cloud("a")
     robot = world.robot()
@@ -216,7 +216,7 @@ def served(world: World, server: str) -> dict[str, tuple[float, float | None]]:
 
 
 @pytest.mark.audit("ops-12")
-def test_a_server_that_lost_a_service_is_told_of_and_one_that_goes_in_order_is_not() -> None:
+def test_a_server_that_lost_a_service_is_reported_and_one_that_goes_in_order_is_not() -> None:
     world = World(Settings(warm_up_s=0.0))
     server = world.cloud("a")
     assert served(world, "a") == {PLAN: (1.0, 0.0)}
@@ -250,7 +250,7 @@ def test_what_the_policy_lets_nobody_offer_is_not_missed() -> None:
 
 
 @pytest.mark.audit("ops-12")
-def test_a_server_that_answers_nobody_is_told_of_until_it_answers_somebody() -> None:
+def test_a_server_that_answers_nobody_is_reported_until_it_answers_somebody() -> None:
     world = World(Settings(warm_up_s=0.0))
     server = world.cloud("a")
     world.cloud("b")
@@ -280,7 +280,7 @@ def test_a_server_that_answers_nobody_is_told_of_until_it_answers_somebody() -> 
     assert reports(robot) == 5.0
     world.say(server, ServiceSet())
     world.say(server, ServiceSet((offer(),)))
-    assert served(world, "a") == {PLAN: (1.0, 0.0)}, "its node was started anew"
+    assert served(world, "a") == {PLAN: (1.0, 0.0)}, "its node was restarted"
     assert reports(robot, lost=5) == 5.0
     world.drop_stream(server)
     world.say(world.join(registration("a", Role.CLOUD, incarnation=2)), ServiceSet((offer(),)))
@@ -307,7 +307,7 @@ def test_who_is_gone_has_no_row_of_unanswered_requests_nor_a_word_on_one() -> No
 
 
 @pytest.mark.audit("ops-12")
-def test_a_robot_is_told_of_the_servers_that_the_policy_lets_it_call() -> None:
+def test_a_robot_learns_of_the_servers_that_the_policy_lets_it_call() -> None:
     """Where the only one is stopped, no network of the robot is at fault."""
     world = World(Settings(warm_up_s=0.0))
     first = world.cloud("a")
@@ -355,7 +355,7 @@ def test_who_has_never_reached_a_server_is_no_witness_of_its_end() -> None:
 
 
 @pytest.mark.audit("ops-11")
-def test_paths_to_who_said_goodbye_or_is_forbidden_are_not_told_of_as_up() -> None:
+def test_paths_to_who_said_goodbye_or_is_forbidden_are_not_reported_as_up() -> None:
     world = World(Settings(warm_up_s=0.0))
     left, kept = world.cloud("a"), world.cloud("b")
     robot = world.robot()
@@ -376,7 +376,7 @@ def test_paths_to_who_said_goodbye_or_is_forbidden_are_not_told_of_as_up() -> No
     assert kept.stream is not None
 
 
-def test_a_target_is_told_of_also_where_the_mapping_is_not_chosen_by_it() -> None:
+def test_a_target_is_reported_also_where_the_mapping_is_not_chosen_by_it() -> None:
     world = World(Settings(warm_up_s=0.0))
     robot = world.robot()
     world.say(robot, ServiceSet((), (replace(use(), redundancy=RedundancyMode.ADAPTIVE, wanted_miss=0.01),)))
@@ -402,7 +402,7 @@ def test_paths_to_a_server_that_is_gone_have_no_series() -> None:
     assert servers() == {"b"}
 
 
-def test_who_does_not_confirm_its_mapping_is_told_of() -> None:
+def test_who_does_not_confirm_its_mapping_is_reported() -> None:
     world = World(Settings(warm_up_s=0.0))
     world.cloud("a")
     robot = world.robot()
@@ -447,7 +447,7 @@ def test_who_died_together_with_the_control_plane_is_gone_since_it_was_found_out
     assert value(found, "plr_sidecar_last_seen_timestamp_seconds", **member) == pytest.approx(1.699e9, abs=10.0)
 
 
-def test_a_member_is_told_of_once_also_where_the_policy_cut_it_off() -> None:
+def test_a_member_is_reported_once_also_where_the_policy_cut_it_off() -> None:
     world = World(Settings(warm_up_s=0.0))
     world.robot()
     world.say(world.sidecars[NodeName("robot")], ServiceSet((), (use(),)))

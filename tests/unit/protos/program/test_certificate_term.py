@@ -1,4 +1,4 @@
-"""What a node's owner is told of its certificate, and what the programs do then."""
+"""What a node's owner learns about its certificate, and what the programs do then."""
 
 from __future__ import annotations
 

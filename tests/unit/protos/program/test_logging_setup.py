@@ -101,7 +101,7 @@ def test_a_stalled_stream_does_not_stall_who_logs_and_the_loss_is_told(monkeypat
     assert dropped + text.count(": line ") == 50
 
 
-def test_a_stream_stalled_for_good_does_not_keep_the_program_from_ending(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_stream_stalled_permanently_does_not_keep_the_program_from_ending(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(logging_setup, "STOP_TIMEOUT_S", 0.05)
     stream = StalledStream()
     with logging_to(stream, "info", max_waiting=2):

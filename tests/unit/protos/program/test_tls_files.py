@@ -1,4 +1,4 @@
-"""A node's folder of TLS files: refused with a line that tells what to do, and loaded anew when it changes."""
+"""A node's folder of TLS files: refused with a line that tells what to do, and loaded again when it changes."""
 
 from __future__ import annotations
 
@@ -151,7 +151,7 @@ def test_a_change_before_the_first_look_is_seen(folder: Path, ca: Authority) -> 
     assert new.crl_pem != files.crl_pem
 
 
-def test_files_written_anew_with_the_same_content_are_no_news(folder: Path) -> None:
+def test_files_written_again_with_the_same_content_are_no_news(folder: Path) -> None:
     watch = TlsWatch(load_tls_files(folder))
     watch.poll()
     (folder / "cert.pem").write_bytes((folder / "cert.pem").read_bytes())

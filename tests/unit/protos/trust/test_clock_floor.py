@@ -54,7 +54,7 @@ def test_an_earlier_runs_floor_holds(clock: Clock) -> None:
     assert ClockFloor(clock, BEGUN).now() == BEGUN
 
 
-def test_a_clock_that_is_behind_is_told_of_once(clock: Clock) -> None:
+def test_a_clock_that_is_behind_is_reported_once(clock: Clock) -> None:
     told: list[str] = []
     floor = ClockFloor(clock, BEGUN, alert=told.append)
     clock.time = BEGUN - SLACK_S + 1

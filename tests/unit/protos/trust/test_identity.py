@@ -200,7 +200,7 @@ def pem(recipe: Recipe) -> bytes:
         CA.ca_pem + pem(Recipe()),
         CA.ca_pem * (MAX_CA_CERTIFICATES + 1),
     ],
-    # Workers of one run must agree on names, and keys are made anew in each.
+    # Workers of one run must agree on names, and new keys are made in each.
     ids=map(str, range(10)),
 )
 def test_what_is_no_ca_is_not_trusted(ca_pem: bytes) -> None:

@@ -163,7 +163,7 @@ def test_ping_says_that_nobody_answers(tmp_path: Path, impostor: Impostor, capsy
     assert capsys.readouterr().err == "plr ping: the sidecar does not answer: it is stopped, or very busy\n"
 
 
-def test_statistics_are_told_of_a_sidecar_that_ended(
+def test_statistics_are_shown_of_a_sidecar_that_ended(
     tmp_path: Path, impostor: Impostor, capsys: pytest.CaptureFixture[str]
 ) -> None:
     def say(number: int) -> Iterator[bytes]:

@@ -60,7 +60,7 @@ class ScriptedSocket(socket.socket):
 
 
 class End:
-    """One end: a scripted socket, what it counted and whom it told of datagrams too long."""
+    """One end: a scripted socket, what it counted and whom it informed about datagrams too long."""
 
     def __init__(self) -> None:
         self.socket = ScriptedSocket()
@@ -137,7 +137,7 @@ def test_a_kernel_that_refuses_to_segment_costs_nothing_but_system_calls(
     assert caplog.text.count("wlan0: the kernel does not segment datagrams") == 1
 
 
-def test_datagrams_too_long_for_the_device_are_told_of_and_the_rest_leaves(ends: tuple[End, End]) -> None:
+def test_datagrams_too_long_for_the_device_are_reported_and_the_rest_leaves(ends: tuple[End, End]) -> None:
     near, far = ends
     near.socket.longest = SEGMENT - 1
     batch, datagrams = batch_for(far, 4, last=100)

@@ -65,7 +65,7 @@ def test_each_end_pings_the_other_and_sees_its_paths(nodes: tuple[Node, Node]) -
 
 
 @pytest.mark.audit("ops-14")
-def test_a_peer_that_is_gone_is_told_of(nodes: tuple[Node, Node]) -> None:
+def test_a_peer_that_is_gone_is_reported(nodes: tuple[Node, Node]) -> None:
     robot, cloud = nodes
     cloud.stop()
     deadline = time.monotonic() + PATIENCE_S
@@ -176,7 +176,7 @@ def test_tells_when_interfaces_or_peers_are_others(nodes: tuple[Node, Node], mon
             time.sleep(0.01)
 
 
-def test_requests_go_on_while_the_credential_is_signed_anew(nodes: tuple[Node, Node]) -> None:
+def test_requests_go_on_while_the_credential_is_signed_again(nodes: tuple[Node, Node]) -> None:
     robot, cloud = nodes
     for number in range(10):
         for node in (robot, cloud):

@@ -117,7 +117,7 @@ def test_an_mtu_that_is_too_small_is_warned_of(host: Host, caplog: pytest.LogCap
 
 
 @pytest.mark.audit("ops-13")
-def test_a_wanted_interface_that_carries_nothing_is_told_of_by_name(host: Host) -> None:
+def test_a_wanted_interface_that_carries_nothing_is_reported_by_name(host: Host) -> None:
     host.look()
     assert list(host.down) == ["lo"], "named by the configuration, and not there at boot"
     host.look(LO)
@@ -127,7 +127,7 @@ def test_a_wanted_interface_that_carries_nothing_is_told_of_by_name(host: Host) 
 
 
 @pytest.mark.audit("ops-13")
-def test_a_port_that_a_glob_matches_is_told_of_only_when_it_was_in_use(host: Host) -> None:
+def test_a_port_that_a_glob_matches_is_reported_only_when_it_was_in_use(host: Host) -> None:
     host.manager._config = host.manager._config.model_copy(update={"interfaces": ("lo*",)})
     never = replace(LO, name=InterfaceName("lo-spare"), index=77, carrier=False)
     host.look(LO, never)

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 
 def states(work: Callable[[threading.Event], object]) -> list[bool]:
-    """What is told of a thread at this work, some times."""
+    """Return what is seen of a thread at this work, several times."""
     over = threading.Event()
     thread = threading.Thread(target=work, args=(over,), daemon=True)
     thread.start()

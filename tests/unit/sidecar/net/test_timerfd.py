@@ -50,7 +50,7 @@ def test_arming_at_latest_moves_it_only_earlier() -> None:
     assert fired(timer)
 
 
-def test_arming_anew_forgets_the_time_before() -> None:
+def test_arming_again_forgets_the_time_before() -> None:
     timer = Timer()
     timer.arm(0.0)
     timer.arm(time.monotonic() + 3600.0)

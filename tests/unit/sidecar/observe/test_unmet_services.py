@@ -1,4 +1,4 @@
-"""A configured name that nobody serves is told of once, with the name that was probably meant."""
+"""A configured name that nobody serves is reported once, with the name that was probably meant."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ pytestmark = pytest.mark.audit("ops-5")
 PLAN, WHERE = ServiceName("/plan"), ServiceName("/where_i_am")
 
 
-def test_a_name_that_was_never_served_is_told_of_once_after_the_start() -> None:
+def test_a_name_that_was_never_served_is_reported_once_after_the_start() -> None:
     unmet = UnmetServices([PLAN, WHERE, "/arm/*"], 100.0)
     assert unmet.look(set(), {}, 100.0 + GRACE_S / 2) == []
     assert unmet.unmet == frozenset()
     assert unmet.look({PLAN}, {}, 100.0 + GRACE_S) == [WHERE]
     assert unmet.unmet == {WHERE}
     assert unmet.look({PLAN}, {}, 200.0) == []
-    assert unmet.look({WHERE}, {}, 300.0) == [], "what is withdrawn is told of by who withdraws it"
+    assert unmet.look({WHERE}, {}, 300.0) == [], "what is withdrawn is reported by who withdraws it"
     assert unmet.unmet == {PLAN}
 
 

@@ -81,7 +81,7 @@ def test_a_publication_takes_turns_and_reaches_all(world: World, monkeypatch: py
 
 
 @pytest.mark.audit("ops-20")
-def test_a_dead_server_costs_no_estimates_anew(world: World, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_dead_server_costs_no_new_estimates(world: World, monkeypatch: pytest.MonkeyPatch) -> None:
     robots = fleet(world)
     assert {*robots[0].pairs().values()} == {"a", "b"}
     estimated = []

@@ -203,7 +203,7 @@ def test_the_revocation_list_goes_to_all_at_once_and_to_who_comes_later(world: W
 
 
 @pytest.mark.audit("ops-19")
-def test_a_large_fleet_is_told_of_a_revocation_list_in_turns_and_nobody_is_left_out(
+def test_a_large_fleet_learns_of_a_revocation_list_in_turns_and_nobody_is_left_out(
     world: World, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(control, "TOLD_AT_ONCE", 3)

@@ -34,7 +34,7 @@ def test_weight_halves_with_each_half_life() -> None:
 
 
 @pytest.mark.audit("ops-20")
-def test_however_many_samples_are_claimed_they_can_be_told_of() -> None:
+def test_however_many_samples_are_claimed_they_can_be_reported() -> None:
     most = Histogram.from_sparse([20, 40], [MAX_COUNT // 4, 3 * MAX_COUNT // 4], 0)
     made = faded(most)
     for _ in range(1000):

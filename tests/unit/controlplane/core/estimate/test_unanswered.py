@@ -27,7 +27,7 @@ ENOUGH = 5
 def says(
     rows: Unanswered, robot: NodeName, now: float, *, answered: int = 0, lost: int = 0, server: str = SERVER
 ) -> int:
-    """Report; returns what is told of the server then."""
+    """Report; return what is known of the server then."""
     times = histogram(0.01, times=answered, lost=lost)
     rows.note(robot, [latency("wlan0", server, Histogram(), processing=times)], now)
     return rows.row(SERVER, PLAN, now)

@@ -1,4 +1,4 @@
-"""Which robots are drawn anew, and when a block counts as the same."""
+"""Which robots are drawn again, and when a block counts as the same."""
 
 from __future__ import annotations
 

@@ -27,7 +27,7 @@ def test_the_table_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
     assert lines.take("a", 0.0) is None
     lines.take("b", 0.0)
     lines.take("c", 0.0)
-    assert lines.take("a", 0.0) == 0, "forgotten, and counted anew"
+    assert lines.take("a", 0.0) == 0, "forgotten, and counted from zero"
     assert lines.shares.forgotten == 2
 
 

@@ -1,4 +1,4 @@
-"""What is told of a target that no mapping meets."""
+"""What is said about a target that no mapping meets."""
 
 from __future__ import annotations
 

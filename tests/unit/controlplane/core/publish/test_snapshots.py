@@ -163,7 +163,7 @@ def test_who_reconnects_with_the_version_sent_last_needs_nothing(versions: Versi
     assert track.sent == "a"
 
 
-def test_who_reconnects_with_another_version_is_sent_everything_anew(versions: VersionSource) -> None:
+def test_who_reconnects_with_another_version_is_sent_everything_again(versions: VersionSource) -> None:
     track: Track[str] = Track()
     track.send("a", versions)
     ack(track)
@@ -174,7 +174,7 @@ def test_who_reconnects_with_another_version_is_sent_everything_anew(versions: V
     assert track.send("b", versions) > second
 
 
-def test_a_refused_version_is_sent_anew_on_the_next_stream(versions: VersionSource) -> None:
+def test_a_refused_version_is_sent_again_on_the_next_stream(versions: VersionSource) -> None:
     track: Track[str] = Track()
     version = track.send("a", versions)
     nack(track)
@@ -205,7 +205,7 @@ def test_names_a_sidecar_may_know_grow_until_it_acknowledges(versions: VersionSo
 
 
 @pytest.mark.audit("ops-17")
-def test_who_holds_what_no_control_plane_of_ours_gave_out_begins_anew(versions: VersionSource) -> None:
+def test_who_holds_what_no_control_plane_of_ours_gave_out_starts_over(versions: VersionSource) -> None:
     track: Track[tuple[int, ...]] = Track()
     for held in (MAX_VERSION, MAX_LIFTED):
         track.begin_stream(Version(held))

@@ -1,4 +1,4 @@
-"""What one sidecar is told of the others: each peer with the token for this sidecar."""
+"""What one sidecar learns about the others: each peer with the token for this sidecar."""
 
 from __future__ import annotations
 

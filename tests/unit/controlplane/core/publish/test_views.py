@@ -1,4 +1,4 @@
-"""Who is told of whom, and of what."""
+"""Who learns of whom, and of what."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ def test_notices_name_those_known_but_not_listed_with_their_reason() -> None:
     )
 
 
-def test_who_has_nothing_to_call_is_not_told_of_and_goes_at_once() -> None:
+def test_who_has_nothing_to_call_is_not_announced_and_goes_at_once() -> None:
     members = registry({"a": ("/plan",), "b": ("/plan",)})
     views = Views(members, Permits(ONLY_A), KnownPeers())
     robot = of(members, "robot")

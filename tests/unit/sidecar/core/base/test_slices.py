@@ -1,4 +1,4 @@
-"""No job of the backlog keeps another one, or a timer, waiting for good."""
+"""No job of the backlog keeps another one, or a timer, waiting for ever."""
 
 from __future__ import annotations
 

@@ -12,7 +12,7 @@ class TopOfRange(random.Random):
         return b
 
 
-def test_the_bound_doubles_up_to_the_largest_and_starts_anew_after_a_reset() -> None:
+def test_the_bound_doubles_up_to_the_largest_and_starts_over_after_a_reset() -> None:
     backoff = Backoff(TopOfRange(), first_s=0.2, max_s=1.0)
     assert [backoff.next_delay_s() for _ in range(5)] == [0.2, 0.4, 0.8, 1.0, 1.0]
     backoff.reset()

@@ -136,8 +136,8 @@ def test_addresses_signed_with_a_renewed_certificate_wait_for_the_stream_that_na
     session.set_candidates(CANDIDATES)
     assert session.messages_to_send(0.0) == [CANDIDATES]
     session.set_credential(b"renewed")
-    signed_anew = replace(CANDIDATES, serial=2, signature=b"with the new key")
-    session.set_candidates(signed_anew)
+    signed_again = replace(CANDIDATES, serial=2, signature=b"with the new key")
+    session.set_candidates(signed_again)
     session.set_services(SERVICES)
     assert session.messages_to_send(0.0) == [SERVICES]
     session.closed(1.0)
@@ -146,7 +146,7 @@ def test_addresses_signed_with_a_renewed_certificate_wait_for_the_stream_that_na
     assert isinstance(registration, Registration)
     assert registration.credential == b"renewed"
     session.receive(WELCOME, 1.0)
-    assert session.messages_to_send(1.0) == [signed_anew, SERVICES]
+    assert session.messages_to_send(1.0) == [signed_again, SERVICES]
 
 
 @pytest.mark.parametrize("content", [peers(9, nonce=5), mapping(9, nonce=5)])
@@ -306,7 +306,7 @@ def test_the_newest_mapping_that_was_refused_is_kept_until_one_is_taken() -> Non
 
 
 def test_a_mapping_that_is_taken_late_is_no_answer_to_the_control_plane() -> None:
-    """It counts the version as refused for good, and may give the next one any number above what it was told."""
+    """It counts the version as refused permanently, and may give the next one any number above what it was told."""
     session = online(make_session(mapping=4))
     event = session.receive(mapping(6), 0.0)
     assert isinstance(event, Apply)

@@ -73,7 +73,7 @@ def test_whatever_they_differ_in_gives_other_keys(what: str) -> None:
     assert keys_of(changed).secret != keys_of().secret
 
 
-def test_a_credential_signed_anew_gives_the_same_keys() -> None:
+def test_a_credential_signed_again_gives_the_same_keys() -> None:
     again = replace(ROBOT, certificate=b"renewed", signature=b"again")
     assert keys_of(again) == keys_of()
 

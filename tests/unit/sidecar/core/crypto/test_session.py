@@ -45,7 +45,7 @@ def test_a_credential_is_judged_once_until_trust_changes() -> None:
 
 
 @pytest.mark.audit("sec-6")
-def test_a_credential_that_has_ended_is_judged_anew() -> None:
+def test_a_credential_that_has_ended_is_judged_again() -> None:
     own, looked_at = judged()
     own.admit(peer(A))
     assert own.has_admitted(peer(A).credential)
@@ -102,7 +102,7 @@ def test_what_is_remembered_is_capped(monkeypatch: pytest.MonkeyPatch) -> None:
         assert len(own._admitted) <= 3
 
 
-def test_only_the_same_session_may_be_signed_anew() -> None:
+def test_only_the_same_session_may_be_signed_again() -> None:
     own = session_of("robot-1", Role.ROBOT, 9)
     renewed = replace(own.credential, certificate=b"newer", signature=b"newer")
     own.renew(renewed)

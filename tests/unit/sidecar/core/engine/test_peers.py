@@ -159,7 +159,7 @@ def test_a_peer_cannot_take_the_session_of_another() -> None:
 
 @pytest.mark.audit("sec-4")
 def test_one_that_is_refused_takes_no_session_of_a_living_peer() -> None:
-    """The control plane started anew; somebody registered with the number of a peer that is only known by its paths."""
+    """The control plane restarted; somebody registered with the number of a peer that is only known by its paths."""
     judge = Judge()
     judge.wrong = {B: CertificateError(MALFORMED, "the credential's session number is not that of its key")}
     peers = judge.peers
@@ -212,7 +212,7 @@ def test_a_peer_whose_credential_is_bad_is_no_peer_and_one_held_for_its_paths_is
     assert [link_peer.name for link_peer in peers.for_links()] == [B]
 
 
-def test_peers_are_judged_anew_when_trust_changes() -> None:
+def test_peers_are_judged_again_when_trust_changes() -> None:
     revoked: set[str] = set()
 
     def judge(credential: SessionCredential) -> float:

@@ -280,7 +280,7 @@ def test_a_path_that_lives_outlives_a_view_that_forgot_it() -> None:
     assert bench.wait(10.0) == [], "nothing is left of it"
 
 
-def test_a_link_opened_anew_goes_on_with_the_packet_numbers_of_the_one_before() -> None:
+def test_a_link_opened_again_goes_on_with_the_packet_numbers_of_the_one_before() -> None:
     bench = up()
     bench.receive(PROBE, number=9)
     first = numbers(bench.sent())[-1] + 1

@@ -63,7 +63,7 @@ def test_an_introduction_is_answered_where_it_came_from_in_fewer_bytes_and_moves
 
 
 def test_who_introduces_itself_again_after_an_answer_is_introduced_to_at_that_place() -> None:
-    """It can not read the answer of a session that it does not know yet."""
+    """It cannot read the answer of a session that it does not know yet."""
     bench = up()
     for number in (0, 1):
         bench.receive_datagram(bench.introduction(number=number, interface=NEW_INTERFACE), ELSEWHERE)
@@ -71,7 +71,7 @@ def test_who_introduces_itself_again_after_an_answer_is_introduced_to_at_that_pl
         assert any(isinstance(item, Introduction) for item in answers) is (number == 1)
 
 
-def test_a_credential_signed_anew_is_introduced_from_then_on() -> None:
+def test_a_credential_signed_again_is_introduced_from_then_on() -> None:
     bench = Bench()
     (before,) = bench.frames(bench.sent())
     renewed = replace(bench.own.credential, certificate=b"renewed", signature=b"again")

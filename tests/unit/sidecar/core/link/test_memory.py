@@ -104,7 +104,7 @@ def test_the_next_link_inherits_copies_and_what_was_forgotten() -> None:
     assert inherited.received is not original.received, "the link before may not have ended"
 
 
-def test_whoever_has_a_name_after_one_that_was_revoked_begins_anew() -> None:
+def test_whoever_has_a_name_after_one_that_was_revoked_starts_over() -> None:
     """A thief may have used, and left behind, the largest incarnations there are."""
     last = 2**64 - 1
     memory = filled(range(last - MAX_PATHS_OF_A_PEER, last + 1))

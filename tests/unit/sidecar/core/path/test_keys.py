@@ -159,7 +159,7 @@ def test_the_same_offer_has_the_same_answer_and_another_one_has_to_wait() -> Non
     assert cloud.answer(other, 0.1, rng) is None, "each costs some public-key work"
     newer = cloud.answer(other, OTHER_OFFER_AFTER_S, rng)
     assert newer is not None
-    assert again.take(newer, 1.0), "as of a link that began anew"
+    assert again.take(newer, 1.0), "as of a link that started over"
     with pytest.raises(DecodeError):
         robot.take(newer, 1.0)
     assert opens(cloud.opening, sealed(again, 1))

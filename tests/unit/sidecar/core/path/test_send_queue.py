@@ -131,7 +131,7 @@ def test_of_the_late_the_oldest_that_can_still_be_of_use_goes_first() -> None:
     order = []
     while (run := queue.take(5.0, MUCH, PACE)) is not None:
         order += [run.message.number] * (run.message.number not in order)
-    assert order == [5, 3, 4, 2, 1], "what can not arrive before it expires goes last, in case the pace rises"
+    assert order == [5, 3, 4, 2, 1], "what cannot arrive before it expires goes last, in case the pace rises"
 
 
 @pytest.mark.audit("dp-13")

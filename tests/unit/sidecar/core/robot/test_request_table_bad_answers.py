@@ -1,4 +1,4 @@
-"""Answers that can not be delivered: their copies have failed, and others answer in their place."""
+"""Answers that cannot be delivered: their copies have failed, and others answer in their place."""
 
 from __future__ import annotations
 

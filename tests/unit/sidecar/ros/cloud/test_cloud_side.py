@@ -33,7 +33,7 @@ def side() -> Any:
 
 @pytest.mark.audit("dp-15")
 def test_a_dead_server_beside_a_living_one_keeps_nothing_from_it(side: Any) -> None:
-    """A container that was started anew: DDS shows its dead self for 20 s more."""
+    """A container that was restarted: DDS shows its dead self for 20 s more."""
     side._processes = SimpleNamespace(watches=lambda _endpoint: False, has_ended=lambda _endpoint: False)
     silent = {b"old"}
     side._roll_call = SimpleNamespace(

@@ -111,7 +111,7 @@ def test_one_process_does_not_crowd_out_another() -> None:
     assert look(unknown, 2.0, PLAN) == ("/planner",)
 
 
-def test_participants_beyond_the_limit_are_told_of_and_have_room_later() -> None:
+def test_participants_beyond_the_limit_are_reported_and_have_room_later() -> None:
     unknown = UnknownNodes()
     unknown.begin_look()
     for number in range(MAX_PARTICIPANTS + 3):

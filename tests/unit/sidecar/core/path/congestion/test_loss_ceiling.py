@@ -12,7 +12,7 @@ WANTED = 2.0 * IN_FLIGHT
 
 
 class World:
-    """A ceiling, and the round trips it is told of."""
+    """A ceiling, and the round trips it is given."""
 
     def __init__(self, *, lost_first: int = 0) -> None:
         self.ceiling = LossCeiling()

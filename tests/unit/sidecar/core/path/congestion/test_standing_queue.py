@@ -20,7 +20,7 @@ YIELDED_S = YIELD_WINDOWS * YIELD_S
 
 
 class World:
-    """A queue, and the round trips it is told of, one every 10 ms."""
+    """A queue, and the round trips it is given, one every 10 ms."""
 
     def __init__(self) -> None:
         self.queue = StandingQueue()
@@ -29,7 +29,7 @@ class World:
         self.take(FLOOR_S, 1.0)
 
     def take(self, rtt_s: float, seconds: float = 0.3) -> FloorChange | None:
-        """What they told of the floor last."""
+        """What they said about the floor last."""
         told = None
         end = self.now + seconds
         while self.now < end:
@@ -63,7 +63,7 @@ def test_a_moment_is_no_standing_queue_but_the_datagram_met_one() -> None:
     assert not world.queue.is_met_by(1.1 * FLOOR_S, world.rtt)
 
 
-def test_it_is_full_only_about_as_long_as_the_longest_of_late() -> None:
+def test_it_is_full_only_about_as_long_as_the_longest_recent_one() -> None:
     world = World()
     world.take(3 * FLOOR_S)
     assert world.is_full()

@@ -148,7 +148,7 @@ def test_what_left_may_have_run_and_what_did_not_has_not(begun: bool) -> None:
     assert table.sent() == [WLAN_A]
     if begun:
         message.symbol_data(0)
-        # Cut anew, with nothing of the second message under way.
+        # Cut again, with nothing of the second message under way.
         table.outbox.on_forgotten(A, message.number)
     table.outbox.drop_peer(A)
     table.routes.set_state(WLAN_A, PathState.DOWN)

@@ -119,7 +119,7 @@ def test_an_offer_outlasts_what_waited_when_darkness_fell() -> None:
     assert robot.update(50.0) == [WithdrawService(ECHO, "no path to a server for 40 s")]
 
 
-def test_light_in_between_starts_the_wait_anew() -> None:
+def test_light_in_between_starts_the_wait_again() -> None:
     robot = Robot(peer(A))
     robot.update()
     for now, state in (
