@@ -376,7 +376,7 @@ class ControlClient:
         """Give up on an overdue welcome: in a network that swallows everything, gRPC alone would try for 20 s."""
         await asyncio.sleep(max(self._session.next_timer() - time.monotonic(), 0.0))
         if self._session.welcome_overdue(time.monotonic()):
-            raise _StreamEndedError(line.describe() or f"no answer to the registration over {line.way}")
+            raise _StreamEndedError(line.describe() or f"no answer to the registration at {line.way}")
 
     def _on_message(self, message: control_pb2.ControlMessage) -> None:
         try:

@@ -1,13 +1,14 @@
 """plr bugreport: collect what a helper needs to find a fault on this node, in one tar file, without secrets.
 
 examples:
-  plr bugreport                                write plr-bugreport-NAME-TIME.tar.gz in this folder
+  plr bugreport                                write plr-bugreport-NAME-TIME.tar.gz in the current folder
   plr bugreport --output /tmp/report.tar.gz
   plr bugreport --config try/robot.yaml
 
-In it: the configuration, what plr doctor finds, versions, the last journal lines, addresses and routes, sysctls, the
-metrics. Never in it: keys, certificates, the state folder, the environment beyond what ROS goes by. What looks like a
-secret is replaced by (left out). Names, addresses and services of your fleet are in it: look before you publish it.
+It contains the configuration, what plr doctor finds, versions, the last journal lines, addresses and routes, sysctls,
+and the metrics. It never contains keys, certificates, the state folder, or the environment beyond what ROS uses.
+(left out) replaces what looks like a secret. It names nodes, addresses and services of your fleet: read it before you
+publish it.
 
 exit codes: 0 written, 1 it cannot be written, 2 bad usage
 """
@@ -76,7 +77,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run `plr bugreport` and return its exit code."""
     parser = parser_of("plr bugreport", __doc__)
     parser.add_argument(
-        "--output", type=Path, metavar="FILE", help="default: plr-bugreport-NAME-TIME.tar.gz in this folder"
+        "--output", type=Path, metavar="FILE", help="default: plr-bugreport-NAME-TIME.tar.gz in the current folder"
     )
     options = parser.parse_args(arguments)
     where = where_of(options)

@@ -2,7 +2,7 @@
 
 examples:
   plr doctor                                   the sidecar of /etc/plr/sidecar.yaml, as root or in the group plr
-  plr doctor --config try/robot.yaml           another one
+  plr doctor --config try/robot.yaml           another sidecar
   plr doctor --json | jq '.findings[] | select(.level != "ok")'
 
 Each line is a check: ok, warn (somebody should look) or fail (something does not work), with what to do. Paths are

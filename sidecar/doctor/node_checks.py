@@ -133,7 +133,7 @@ def ros(environment: Mapping[str, str], shell: Mapping[str, str], problem: str |
         yield warn(
             "domain",
             f"ROS_DOMAIN_ID {domain}{note}, discovery {reach}: ROS uses every network and bypasses the sidecar",
-            "set ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST",
+            "set ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST (the unit uses a DDS profile instead)",
         )
 
 

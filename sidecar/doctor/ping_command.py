@@ -6,8 +6,8 @@ examples:
   plr ping cloud-1 -I wwan0 -s 1200     over one interface, datagrams of 1200 bytes
   plr ping robot-7 -c 3 --config /etc/plr/sidecar.yaml
 
-It works while a path rests, and changes nothing of what the sidecar believes of it. A path that is down is not pinged:
-the sidecar itself looks whether it comes back.
+It works while a path rests, and does not change what the sidecar knows about it. A path that is down is not pinged:
+the sidecar itself checks whether it comes back.
 
 exit codes: 0 something was answered, 1 nothing was, 2 bad usage
 """

@@ -179,7 +179,7 @@ def mtu(state: State) -> Iterator[Finding]:
         elif stuck:
             yield warn(
                 "mtu",
-                f"{name}: takes {takes[name]} bytes, but paths to {_names(stuck)} carry only {BASE_BYTES}",
+                f"{name}: takes {takes[name]} bytes, but paths to {_names(stuck)} carry only the minimum, {BASE_BYTES}",
                 "find what drops long packets: a tunnel, or a firewall that drops fragments",
             )
         elif shown:

@@ -170,7 +170,7 @@ def test_stun_that_is_not_answered_is_warned_of_unless_the_other_family_is() -> 
 def test_a_path_that_carries_the_least_only_is_warned_of() -> None:
     stuck = state(paths=[path("wlan0", "cloud-a", max_datagram=1200)])
     (text,) = texts(running_checks.mtu(stuck), Level.WARN)
-    assert "takes 1500 bytes, but paths to cloud-a carry only" in text
+    assert "takes 1500 bytes, but paths to cloud-a carry only the minimum" in text
     searching = state(paths=[path("wlan0", "cloud-a", max_datagram=1200, since_s=5.0)])
     assert texts(running_checks.mtu(searching), *BAD) == []
 
