@@ -71,7 +71,7 @@ class PeerTrust:
     def end_expired(self, now_wall: float) -> None:
         """Drop peers whose certificates have ended by now (seconds since 1970); nearly free if there are none.
 
-        Log which other peers are not talked to any more.
+        Log which other peers are refused from now on.
         """
         if self._own.forget_ended(now_wall):
             with self._lock:
@@ -92,7 +92,7 @@ class PeerTrust:
         with self._turn as (engine, now):
             taken = engine.recheck_peers(judged, now)
         for name in taken:
-            log.info("%s is talked to after all: its credential is good now", name)
+            log.info("%s is accepted now: its credential has become valid", name)
         self.log_news()
         self._reach_changed()
 
@@ -107,13 +107,13 @@ class PeerTrust:
             engine.revocations.on_judged(peer, now, good=good)
 
     def refused(self, at_most: int) -> list[tuple[NodeName, str]]:
-        """Return the peers that are not talked to, and why."""
+        """Return the peers that are refused, and why."""
         with self._lock:
             refused = list(islice(self._engine.peers.refused.values(), at_most))
         return [(refusal.peer.name, refusal.why) for refusal in refused]
 
     def log_news(self) -> None:
-        """Log news about peers that are not talked to, or get no requests."""
+        """Log news about peers that are refused, or get no requests."""
         with self._lock:
             conflicts = self._engine.offer_conflicts
             refused = list(self._engine.peers.refused.values())
@@ -122,13 +122,13 @@ class PeerTrust:
         for refusal in refused:
             if self._logged_refusals.get(refusal.peer.name) != refusal.cause:
                 name, why = refusal.peer.name, refusal.why
-                log.warning("%s is not talked to, whatever the control plane says: %s", name, why)
+                log.warning("%s is refused, although the control plane names it as a peer: %s", name, why)
         self._logged_refusals = {refusal.peer.name: refusal.cause for refusal in refused}
         for name, why in ignored.items():
             if self._logged_candidates.get(name) != why:
-                log.warning("%s: what the control plane tells of its addresses is not used: %s", name, why)
+                log.warning("%s: the addresses that the control plane sent for it are not used: %s", name, why)
         for name in used_again:
-            log.info("%s: what the control plane tells of its addresses is used again", name)
+            log.info("%s: the addresses that the control plane sent for it are used again", name)
         self._logged_candidates = ignored
         for service, server, kind in sorted(conflicts - self._logged_conflicts):
             log.warning(

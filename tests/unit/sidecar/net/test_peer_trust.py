@@ -63,7 +63,7 @@ def test_a_peer_refused_while_the_clock_was_wrong_is_talked_to_when_it_is_right(
         for _ in range(3):
             robot.plane.peer_trust.judge_again()
             robot.plane.peer_trust.trust_changed()
-        assert caplog.text.count("is not talked to") == 1
+        assert caplog.text.count("is refused, although the control plane names it") == 1
         assert cloud.name not in robot.plane._engine.peers
         wrong = False
         robot.plane.peer_trust.judge_again()
@@ -109,8 +109,8 @@ def test_forged_addresses_are_logged_once_and_so_is_their_end(
     with monkeypatch.context() as patch:
         patch.setattr(robot.own, "check_candidates", refuse)
         assert tell(1) == [
-            "what the control plane tells of its addresses is not used: the signature of its addresses is wrong"
+            "the addresses that the control plane sent for it are not used: the signature of its addresses is wrong"
         ]
         assert tell(2) == []
-    assert tell(3) == ["what the control plane tells of its addresses is used again"]
+    assert tell(3) == ["the addresses that the control plane sent for it are used again"]
     assert tell(4) == []
