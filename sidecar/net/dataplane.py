@@ -378,7 +378,7 @@ class ThreadedDataPlane:
                 self._timer_turn()
             except Exception:
                 # Without this thread no deadline would be noticed and no request would end.
-                log.exception("internal error; the timers go on")
+                log.exception("internal error; the timers continue")
                 time.sleep(ERROR_PAUSE_S)
             else:
                 if self._timer.due <= self._clock():

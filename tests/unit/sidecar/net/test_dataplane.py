@@ -108,8 +108,8 @@ def test_an_internal_error_silences_neither_the_timers_nor_the_interface(
     while len(caplog.records) < 2 and time.monotonic() < deadline:
         time.sleep(0.01)
     assert {record.message.split(";")[-1].strip() for record in caplog.records} == {
-        "the timers go on",
-        "the interface goes on",
+        "the timers continue",
+        "the interface continues",
     }
     assert robot.plane._timer_thread.is_alive()
     assert robot.thread._thread.is_alive()
