@@ -12,7 +12,7 @@ unexport ROS_DISTRO ROS_VERSION ROS_PYTHON_VERSION _ROS_WHEELS_BOOTSTRAP_COMPLET
 # Nothing that we start announces itself to the network.
 export ROS_AUTOMATIC_DISCOVERY_RANGE ?= LOCALHOST
 
-.PHONY: help setup demo test quick fuzz lint format protos pages interfaces lock bench bench-quick bench-dataplane bench-churn bench-insiders bench-control bench-fleet-day bench-matcher clean distclean
+.PHONY: help setup demo test quick fuzz lint format protos pages docs interfaces lock bench bench-quick bench-dataplane bench-churn bench-insiders bench-control bench-fleet-day bench-matcher clean distclean
 
 help: ## show this list
 	@echo 'usage: make TARGET'
@@ -51,6 +51,9 @@ protos: setup ## generate the gRPC stubs from protos/plr/v1/*.proto
 
 pages: setup ## write the keys and the figures of the code into docs/use/configuration.md and docs/operate/limits.md
 	@$(PY) -m deploy.dev.pages
+
+docs: setup ## build the site of README.md and docs/ into build/site: open build/site/index.html
+	@deploy/dev/docs.sh
 
 interfaces: setup ## build examples/plr_demo_interfaces into .venv
 

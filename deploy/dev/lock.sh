@@ -14,7 +14,10 @@ compile() {
     --no-annotate --constraint requirements/constraints.txt --custom-compile-command "make lock" "$@"
 }
 
-compile --all-extras pyproject.toml --output-file requirements/dev.txt "$@"
+compile --extra sidecar --extra controlplane --extra ros --extra interfaces --extra dev --extra bench pyproject.toml \
+  --output-file requirements/dev.txt "$@"
+# The same with what builds the site: `make docs` adds it to an environment that has the rest.
+compile --constraint requirements/dev.txt --extra docs pyproject.toml --output-file requirements/docs.txt "$@"
 # One for each thing that is deployed, the same versions as above: the operator's `plr`, a robot or cloud whose rclpy
 # comes from apt, the same with a ROS of its own, the control plane.
 deployed() {

@@ -20,7 +20,9 @@ RUNTIMES = {
     "runtime-ros.txt": ["sidecar", "ros"],
     "runtime-controlplane.txt": ["controlplane"],
 }
-LOCKS = ("dev.txt", *RUNTIMES, "build.txt", "bootstrap.txt")
+ADDED = {"docs.txt": ["docs"]}
+"""What is no part of dev.txt: a target of its own installs it."""
+LOCKS = ("dev.txt", *RUNTIMES, *ADDED, "build.txt", "bootstrap.txt")
 PIN = re.compile(r"^([A-Za-z0-9._-]+)(?:\[[^]]*\])?==(\S+)(?: ; (.*?))? \\$", re.MULTILINE)
 
 Pins = dict[str, set[Version]]
@@ -46,8 +48,9 @@ def unmet(requirements: list[str], locked: Pins) -> list[str]:
 
 def test_everything_asked_for_is_locked() -> None:
     asked = [*PROJECT["dependencies"]]
-    for extra in PROJECT["optional-dependencies"].values():
-        asked += extra
+    for extra, requirements in PROJECT["optional-dependencies"].items():
+        if [extra] not in ADDED.values():
+            asked += requirements
     assert not unmet(asked, pins("dev.txt")), "run: make lock"
 
 
@@ -59,6 +62,15 @@ def test_each_runtime_is_locked_at_the_same_versions(lock: str) -> None:
     runtime, everything = pins(lock), pins("dev.txt")
     assert not unmet(asked, runtime), "run: make lock"
     assert all(everything[package] == versions for package, versions in runtime.items())
+
+
+@pytest.mark.parametrize("lock", ADDED)
+def test_what_is_added_to_the_environment_changes_nothing_in_it(lock: str) -> None:
+    asked = [requirement for extra in ADDED[lock] for requirement in PROJECT["optional-dependencies"][extra]]
+    added, everything = pins(lock), pins("dev.txt")
+    assert not unmet(asked, added), "run: make lock"
+    assert len(unmet(asked, everything)) == len(asked), "make setup would install it"
+    assert all(added[package] == versions for package, versions in everything.items() if package in added)
 
 
 @pytest.mark.audit("ops-9")
@@ -111,3 +123,9 @@ def test_nothing_is_installed_but_by_its_hash(page: str) -> None:
     assert len(own) == 1
     assert all("--require-hashes" in line for line in locked)
     assert all("--no-deps" in line for line in own)
+
+
+def test_the_site_s_builder_is_installed_by_its_hash() -> None:
+    lines = (ROOT / "deploy/dev/docs.sh").read_text().splitlines()
+    (installs,) = [line for line in lines if " install " in line]
+    assert "--require-hashes -r requirements/docs.txt" in installs
