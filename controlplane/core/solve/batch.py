@@ -3,9 +3,10 @@
 Prices by block and server come in as an array with one column more than there are servers: the last, which is 0,
 belongs to an interface that carries no copy. A price of infinity closes a server.
 
-There are two kinds. A `SeparableStack` holds blocks whose cost is a sum over interfaces that all carry a copy. In an
-optimum each interface has one of its I cheapest servers, I being the number of interfaces: otherwise one of these is
-left by the others, and moving there is cheaper and exceeds nothing. An `EnumeratedStack` lists every choice.
+A `SeparableStack` holds blocks whose cost is a sum over interfaces that all carry a copy. In an optimum each interface
+has one of its I cheapest servers, I being the number of interfaces: otherwise one of these is left by the others, and
+moving there is cheaper and exceeds nothing. An `EnumeratedStack` lists choices. A third kind, for blocks with too many
+choices to list, is in `pattern_batch`.
 """
 
 from __future__ import annotations
@@ -58,7 +59,8 @@ class Best(NamedTuple):
     picks: Indices
     """By block, then interface: the server's index, or the stack's number of servers if the interface has none."""
     least: Floats
-    """Lower bound over all choices, with `excess_price` for each interface in excess."""
+    """Lower bound over all choices, with `excess_price` for each interface in excess. Where an `EnumeratedStack` has
+    listed only some choices, it holds for these; `Stack.bound` holds for all."""
 
 
 class Stack(abc.ABC):
@@ -162,9 +164,10 @@ def _match(priced: Floats, capacity: Indices, excess_price: float) -> tuple[Floa
 
 
 class EnumeratedStack(Stack):
-    """Blocks whose choices are listed: all others.
+    """Blocks whose choices are listed.
 
-    If a block has more than `at_most` choices, only some are listed, and its bound comes from `path_bound`.
+    If a block has more than `at_most` choices, only the promising ones are listed. `best` and `near` then find the best
+    of these, and the block's bound comes from `path_bound`.
     """
 
     def __init__(self, objective: Objective, blocks: Sequence[Block], limits: Limits, *, at_most: int) -> None:
