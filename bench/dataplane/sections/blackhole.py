@@ -36,7 +36,7 @@ RATE_HZ = 50.0
 BEFORE = 75
 """Requests before the cut."""
 AFTER = 410
-"""Requests after it, at least."""
+"""Requests due after it; one that leaves during the cut does not count."""
 GRACE_S = 3.0
 """Longest wait for the last answers."""
 ZENOH_PORTS = (7447, 7448)
