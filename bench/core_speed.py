@@ -24,6 +24,7 @@ from plr.sidecar.core.base.values import RequestId
 from plr.sidecar.core.engine.engine import Engine, EngineConfig
 from plr.sidecar.core.link.link import Link
 from plr.sidecar.core.link.sender import LinkIdentity
+from plr.sidecar.core.path.congestion.choice import CONTROLLERS, DEFAULT_CONTROLLER
 from plr.sidecar.core.rules.service_rule import ServiceRule
 from plr.sidecar.core.seam.application import ExecuteRequest, RequestFailed, ResponseArrived
 from plr.sidecar.core.seam.links import SetReady
@@ -44,7 +45,7 @@ ANSWER = bytes(1000)
 class Side:
     """One sidecar with one interface."""
 
-    def __init__(self, name: str, role: Role, session: int, now: float) -> None:
+    def __init__(self, name: str, role: Role, session: int, controller: str, now: float) -> None:
         self.name, self.role = NodeName(name), role
         self.token = session.to_bytes(16, "big")
         self.address = (name, 1)
@@ -53,7 +54,7 @@ class Side:
         self.engine = Engine(EngineConfig(role, (ServiceRule("/*", 10.0, 60.0, idempotent=True),)), self.own, now)
         interface = InterfaceName("eth0")
         identity = LinkIdentity.of(self.own.credential, self.token, interface, InterfaceId(0))
-        self.link = Link(identity, random.Random(session), now)
+        self.link = Link(identity, random.Random(session), now, controller=controller)
         self.link.execute(SetReady(ready=True), now)
         self.engine.set_interfaces([interface], now)
         self.offers = (ServiceOffer(SERVICE, TYPE),) if role is Role.CLOUD else ()
@@ -103,11 +104,11 @@ class Side:
 class Pair:
     """The robot, the cloud and the simulated clock; a side receives `batch` datagrams before it gets its turn."""
 
-    def __init__(self, batch: int) -> None:
+    def __init__(self, batch: int, controller: str) -> None:
         self.now = 1.0
         self.batch = batch
-        self.robot = Side("robot", Role.ROBOT, 1, self.now)
-        self.cloud = Side("cloud", Role.CLOUD, 2, self.now)
+        self.robot = Side("robot", Role.ROBOT, 1, controller, self.now)
+        self.cloud = Side("cloud", Role.CLOUD, 2, controller, self.now)
         self.sent = 0
         self.early: defaultdict[NodeName, list[Batch]] = defaultdict(list)
         """Datagrams that left in the turns between two batches and are still to be carried."""
@@ -186,9 +187,9 @@ TRAFFIC = (
 )
 
 
-def measure(traffic: Traffic, batch: int) -> tuple[str, float]:
+def measure(traffic: Traffic, batch: int, controller: str) -> tuple[str, float]:
     """Run one kind of traffic; return a description of its cost, and the Mbit of payload carried per CPU second."""
-    pair = Pair(batch)
+    pair = Pair(batch, controller)
     payload = random.Random(1).randbytes(traffic.size)
     pair.call(payload, traffic.at_once)  # warm: windows grow, caches fill
     before = pair.robot.datagrams + pair.cloud.datagrams
@@ -214,6 +215,9 @@ def main() -> None:
     parser.add_argument(
         "--batch", type=int, default=16, help="datagrams received between two turns of a side (default 16)"
     )
+    parser.add_argument(
+        "--controller", choices=sorted(CONTROLLERS), default=DEFAULT_CONTROLLER, help="the paths' congestion controller"
+    )
     arguments = parser.parse_args()
     chosen = [traffic for traffic in TRAFFIC if arguments.only in traffic.name]
     print(
@@ -223,13 +227,13 @@ def main() -> None:
     for traffic in chosen:
         if arguments.profile:
             with cProfile.Profile() as profile:
-                line, _ = measure(traffic, arguments.batch)
+                line, _ = measure(traffic, arguments.batch, arguments.controller)
             print(line)
             pstats.Stats(profile).sort_stats("tottime").print_stats(25)
         else:
-            line, sealed = measure(traffic, arguments.batch)
+            line, sealed = measure(traffic, arguments.batch, arguments.controller)
             with null_cipher():
-                _, clear = measure(traffic, arguments.batch)
+                _, clear = measure(traffic, arguments.batch, arguments.controller)
             print(f"{line} {clear:26.0f} {sealed / clear:24.2f}")
 
 

@@ -7,7 +7,8 @@ import random
 from itertools import count
 from typing import TYPE_CHECKING
 
-from plr.sidecar.core.path.congestion.controller import CongestionController, RateSample
+from plr.sidecar.core.path.congestion.choice import CONTROLLERS, DEFAULT_CONTROLLER
+from plr.sidecar.core.path.congestion.controller import RateSample
 from plr.sidecar.core.path.congestion.rtt import RttEstimator
 
 if TYPE_CHECKING:
@@ -145,9 +146,9 @@ class Flow:
 class OurFlow(Flow):
     """A bulk sender, or with `want` set one that sends only so many bytes."""
 
-    def __init__(self, net: Bottleneck) -> None:
+    def __init__(self, net: Bottleneck, controller: str = DEFAULT_CONTROLLER) -> None:
         super().__init__(net)
-        self.control = CongestionController()
+        self.control = CONTROLLERS[controller]()
         self.want: int | None = None
         self._timer = 0.0
 

@@ -7,12 +7,12 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import pytest
 
+from plr.sidecar.core.path.congestion.model_controller import ModelController
 from plr.sidecar.core.path.send_queue import Turn
 from tests.support.mesh import Mesh, Node, Wire, rule
 
 if TYPE_CHECKING:
     from plr.sidecar.core.base.values import ExecutionId, RequestId
-    from plr.sidecar.core.path.congestion.controller import CongestionController
 
 MBIT = 1e6 / 8
 HZ = 10
@@ -38,9 +38,10 @@ class World:
         self.mesh.run(1.0)
 
     @property
-    def control(self) -> CongestionController:
+    def control(self) -> ModelController:
         (link,) = self.robot.links.values()
         (path,) = link._paths.values()
+        assert isinstance(path.control, ModelController)
         return path.control
 
     def request(self, size: int, seconds: float, hz: int = HZ) -> list[RequestId]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from plr.sidecar.core.path.congestion.controller import INITIAL_WINDOW_BYTES, UNPROVEN_S
+from plr.sidecar.core.path.congestion.model_controller import INITIAL_WINDOW_BYTES, UNPROVEN_S
 from tests.sim.test_paced_requests import MBIT, World
 
 LARGE = 500_000

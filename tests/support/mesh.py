@@ -18,6 +18,7 @@ from plr.sidecar.core.base.values import RequestId
 from plr.sidecar.core.engine.engine import Engine, EngineConfig
 from plr.sidecar.core.link.link import Link
 from plr.sidecar.core.link.sender import LinkIdentity
+from plr.sidecar.core.path.congestion.choice import DEFAULT_CONTROLLER
 from plr.sidecar.core.path.key_exchange import DEFAULT_LIMITS
 from plr.sidecar.core.path.pmtu import HEADERS_V4
 from plr.sidecar.core.rules.service_rule import ServiceRule
@@ -108,6 +109,7 @@ class Node:
                 random.Random(self.mesh.rng.random()),
                 now,
                 limits=self.mesh.key_limits,
+                controller=self.mesh.controller,
             )
             for number, interface in enumerate(self.interfaces)
         }
@@ -194,6 +196,8 @@ class Mesh:
         self.version = 0
         self.calls = 0
         self.key_limits = DEFAULT_LIMITS
+        self.controller = DEFAULT_CONTROLLER
+        """The congestion controller of all paths; set it before nodes start."""
         self.budgets: tuple[Budget, ...] = ()
         """Of robots; set it before they start."""
         self.aeads: dict[str, Aead] = {}

@@ -16,6 +16,7 @@ from plr.sidecar.core.link.mtu import LinkMtu
 from plr.sidecar.core.link.path_table import PathTable
 from plr.sidecar.core.link.receiver import LinkReader
 from plr.sidecar.core.link.sender import Batch, Burst, DatagramBuilder
+from plr.sidecar.core.path.congestion.choice import DEFAULT_CONTROLLER
 from plr.sidecar.core.path.key_exchange import DEFAULT_LIMITS, KeyLimits
 from plr.sidecar.core.path.view import view_of
 from plr.sidecar.core.seam.links import (
@@ -76,10 +77,14 @@ class Link:
         now: float,
         memory: LinkMemory | None = None,
         limits: KeyLimits = DEFAULT_LIMITS,
+        controller: str = DEFAULT_CONTROLLER,
     ) -> None:
-        """Create the link; `memory` is what this interface's previous link, in the same session, left by `remember`."""
+        """Create the link; `memory` is what this interface's previous link, in the same session, left by `remember`.
+
+        `controller` names the congestion controller of its paths (`path/congestion/choice.py`).
+        """
         self.identity = identity
-        table = self._table = PathTable(identity, LinkMemory() if memory is None else memory, limits, rng)
+        table = self._table = PathTable(identity, LinkMemory() if memory is None else memory, limits, controller, rng)
         self.stats = table.stats
         self._builder = DatagramBuilder(identity, table.stats)
         self._mtu = LinkMtu(table.events)

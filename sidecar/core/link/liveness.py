@@ -44,7 +44,7 @@ class PathKeeper:
         # A datagram declared lost too early proves life as well as any other: where round trips grow faster than the
         # timeouts, all of them are such. Each datagram counts once: a repeated acknowledgement proves nothing.
         if late := recovery.late(ack, now):
-            path.control.policer.on_spurious(sum(run.size for run in late))
+            path.control.on_spurious(sum(run.size for run in late))
         arrived = newly + late
         if not arrived:
             return

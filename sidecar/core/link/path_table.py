@@ -10,6 +10,7 @@ from plr.protos.model.ids import Role
 from plr.sidecar.core.base.values import PathId, PathState
 from plr.sidecar.core.link.memory import LinkMemory
 from plr.sidecar.core.link.pinging import Pings
+from plr.sidecar.core.path.congestion.choice import CONTROLLERS
 from plr.sidecar.core.path.key_exchange import EXCHANGES_AT_ONCE, EXCHANGES_PER_S
 from plr.sidecar.core.path.keys import make_path_keys
 from plr.sidecar.core.path.path import Path
@@ -52,13 +53,17 @@ class PathTable:
     """Paths, who may use them, and their events and counters."""
 
     __slots__ = (
-        "_by_peer", "_exchanges", "_limits", "_memory", "_new_paths", "_rng", "_unproven", "by_hello", "by_session",
-        "closing", "dirty", "events", "identity", "paths", "pings", "stats",
+        "_by_peer", "_exchanges", "_limits", "_make_control", "_memory", "_new_paths", "_rng", "_unproven", "by_hello",
+        "by_session", "closing", "dirty", "events", "identity", "paths", "pings", "stats",
     )  # fmt: skip
 
-    def __init__(self, identity: LinkIdentity, memory: LinkMemory, limits: KeyLimits, rng: random.Random) -> None:
+    def __init__(
+        self, identity: LinkIdentity, memory: LinkMemory, limits: KeyLimits, controller: str, rng: random.Random
+    ) -> None:
+        """Create the table; `controller` names the congestion controller of its paths."""
         self._memory = memory
         self._limits = limits
+        self._make_control = CONTROLLERS[controller]
         self._rng = rng
         self._unproven: dict[NodeName, TokenBucket] = {}
         """Bytes that may go to addresses that each peer has never proven."""
@@ -151,8 +156,19 @@ class PathTable:
             self._unproven[peer.name] = TokenBucket(rate=UNPROVEN_BYTES_PER_S, burst=UNPROVEN_BYTES, now=now)
         if peer.name not in self._exchanges:
             self._exchanges[peer.name] = TokenBucket(rate=EXCHANGES_PER_S, burst=EXCHANGES_AT_ONCE, now=now)
-        budgets = self._unproven[peer.name], self._exchanges[peer.name]
-        return Path(path_id, peer.session, keys, addresses, first_number, now, self._rng, *budgets, leads=leads)
+        return Path(
+            path_id,
+            peer.session,
+            keys,
+            addresses,
+            first_number,
+            now,
+            self._rng,
+            self._unproven[peer.name],
+            self._exchanges[peer.name],
+            self._make_control,
+            leads=leads,
+        )
 
     def way_changed(self, now: float) -> None:
         """Refill the budgets, since our side of all paths changed: unreachable peers may be reachable now."""

@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING
 from plr.sidecar.core.base.timers import NEVER
 from plr.sidecar.core.base.values import PathId, PathState
 from plr.sidecar.core.path.address import PathAddress
-from plr.sidecar.core.path.congestion.controller import CongestionController
 from plr.sidecar.core.path.congestion.rtt import RttEstimator
 from plr.sidecar.core.path.pmtu import PathMtu
 from plr.sidecar.core.path.probing import Probing
@@ -18,10 +17,11 @@ from plr.sidecar.core.wire.frame import Finished, encode_ack, encode_finished
 
 if TYPE_CHECKING:
     import random
-    from collections.abc import Collection
+    from collections.abc import Callable, Collection
 
     from plr.protos.base.token_bucket import TokenBucket
     from plr.protos.model.ids import Address, InterfaceId, NodeName, SessionId
+    from plr.sidecar.core.path.congestion.controller import CongestionController
     from plr.sidecar.core.path.keys import PathKeys
     from plr.sidecar.core.path.probing import SentPing
     from plr.sidecar.core.wire.frame import KeyAnswer, KeyOffer
@@ -46,6 +46,7 @@ class Path:
         "_exchanges",
         "_introduced_at",
         "_introducer",
+        "_make_control",
         "_oldest_at",
         "_rebound",
         "_rng",
@@ -91,13 +92,15 @@ class Path:
         rng: random.Random,
         unproven: TokenBucket,
         exchanges: TokenBucket,
+        make_control: Callable[[], CongestionController],
         *,
         leads: bool,
     ) -> None:
         """Create the path; `leads`: this end keeps it alive (see `Probing`).
 
         `unproven` limits the bytes that go to addresses that the peer has never proven. All paths to that peer share
-        it. `exchanges` limits how many key exchanges are processed; they share it too.
+        it. `exchanges` limits how many key exchanges are processed; they share it too. `make_control` makes the
+        congestion controller, and another one when the route changes.
         """
         self.id = path_id
         self.remote_id: InterfaceId = path_id.remote
@@ -115,7 +118,8 @@ class Path:
         """The local address from which the kernel sends there, as far as the driver knows."""
         self.state = PathState.DOWN
         self.recovery = Recovery(first_number, rng)
-        self.control = CongestionController()
+        self._make_control = make_control
+        self.control = make_control()
         self.mtu = PathMtu()
         self.queue = SendQueue()
         self.introductions: list[tuple[Address, int, KeyAnswer | None]] = []
@@ -267,7 +271,7 @@ class Path:
     def start_afresh(self, now: float) -> None:
         """Discard what was measured, since the route to the peer changed (RFC 9000 section 9.4)."""
         self.recovery.rtt = RttEstimator()
-        self.control = CongestionController()
+        self.control = self._make_control()
         self.probing.forget()
         self._rebound = True
         self.probing.begin_again(now)
@@ -329,9 +333,8 @@ class Path:
             sent - self.reported_sent,
             lost - self.reported_lost,
             *self._take_fates(),
-            policed=self.control.policer.was_found,
+            policed=self.control.take_policed(),
         )
-        self.control.policer.was_found = False
         self.rtts.clear()
         self.reported_sent, self.reported_lost = sent, lost
         return measured

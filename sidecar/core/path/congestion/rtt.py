@@ -18,6 +18,9 @@ by what both ends may add to it. Older ones would only say that the path lived o
 MINIMUM_MEMORY_S = 10.0
 """A minimum not seen again for this long is forgotten: the route may have become longer (BBR's RTprop filter)."""
 
+PERSISTENT_FACTOR = 3
+"""Probe timeouts without any acknowledgement that make congestion persistent (RFC 9002 section 7.6.1)."""
+
 
 class RttEstimator:
     """Smoothed round-trip time, its variation and its recent minimum, in seconds."""
@@ -78,6 +81,10 @@ class RttEstimator:
         if not self.has_sample:
             return 2 * INITIAL_RTT_S
         return self.smoothed + max(4 * self.variation, GRANULARITY_S) + peer_delay_s
+
+    def persistent_congestion(self, peer_delay_s: float) -> float:
+        """Return the seconds of silence that make congestion persistent (RFC 9002 section 7.6.1)."""
+        return PERSISTENT_FACTOR * self.probe_timeout(peer_delay_s)
 
     def loss_delay(self) -> float:
         """Return the seconds after which a datagram older than an acknowledged one is lost (RFC 9002 section 6.1.2)."""

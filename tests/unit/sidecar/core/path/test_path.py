@@ -7,6 +7,7 @@ import pytest
 from plr.protos.base.token_bucket import TokenBucket
 from plr.protos.model.ids import Address, InterfaceId, Role, SessionId
 from plr.sidecar.core.base.values import PathState
+from plr.sidecar.core.path.congestion.model_controller import ModelController
 from plr.sidecar.core.path.congestion.rtt import UNSTABLE_FLOOR_S
 from plr.sidecar.core.path.key_exchange import DEFAULT_LIMITS
 from plr.sidecar.core.path.keys import make_path_keys
@@ -28,7 +29,9 @@ def new() -> Path:
     )
     agree(keys, theirs, 100.0, RNG)
     budget, exchanges = (TokenBucket(rate=1200.0, burst=65_536, now=100.0) for _ in range(2))
-    return Path(path(), SessionId(1), keys, (HERE, THERE), 0, 100.0, RNG, budget, exchanges, leads=True)
+    return Path(
+        path(), SessionId(1), keys, (HERE, THERE), 0, 100.0, RNG, budget, exchanges, ModelController, leads=True
+    )
 
 
 def ask(subject: Path, now: float) -> int:
