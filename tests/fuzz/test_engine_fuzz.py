@@ -13,8 +13,8 @@ from plr.sidecar.core.cloud.answers import MAX_ANSWER_BYTES, MAX_ANSWERS
 from plr.sidecar.core.cloud.answers import TIMER_SLACK as ANSWER_TIMER_SLACK
 from plr.sidecar.core.cloud.executions import MAX_CACHED_BYTES, MAX_REMEMBERED, MAX_RUNNING, TIMER_SLACK
 from plr.sidecar.core.cloud.refused_copies import MAX_REFUSED_COPIES
-from plr.sidecar.core.link.path_table import MAX_PENDING_FINISHED, MAX_PENDING_FRAMES
 from plr.sidecar.core.message.reassembly import MAX_PEER_BYTES, MAX_PEER_MESSAGES, OVER_REMEMBERED
+from plr.sidecar.core.path.owed import MAX_PENDING_FINISHED, MAX_PENDING_FRAMES
 from plr.sidecar.core.transfer.room import MAX_MESSAGES
 from plr.sidecar.core.wire import frame
 from plr.sidecar.core.wire.frame import BASE_SYMBOL_BYTES, MAX_MESSAGE_BYTES, Header, Probe, ProbeReply
@@ -151,8 +151,8 @@ def assert_bounded(node: Node) -> None:
     for link in node.links.values():
         assert len(link.stats.dropped) < 20
         for path in link._paths.values():
-            assert len(path.pending) <= MAX_PENDING_FRAMES
-            assert len(path.finished) <= MAX_PENDING_FINISHED
+            assert len(path.owed._frames) <= MAX_PENDING_FRAMES
+            assert len(path.owed._finished) <= MAX_PENDING_FINISHED
             assert path.recovery.in_flight >= 0
 
 

@@ -11,7 +11,8 @@ from hypothesis import strategies as st
 from plr.protos.model.ids import InterfaceId, SessionId
 from plr.sidecar.core.base.values import PathId
 from plr.sidecar.core.crypto.aead import TAG_BYTES
-from plr.sidecar.core.link.path_table import MAX_PATHS_OF_A_PEER, MAX_PENDING_FRAMES
+from plr.sidecar.core.link.path_table import MAX_PATHS_OF_A_PEER
+from plr.sidecar.core.path.owed import MAX_PENDING_FRAMES
 from plr.sidecar.core.seam.links import FragmentsReceived, Send
 from plr.sidecar.core.wire import frame
 from plr.sidecar.core.wire.frame import MAX_ACK_RANGES, Header, Probe, ProbeReply
@@ -77,7 +78,7 @@ def assert_bounded(bench: Bench) -> None:
     link = bench.link
     assert 1 <= len(link._paths) <= MAX_PATHS_OF_A_PEER  # its token introduces further ones
     for path in link._paths.values():
-        assert len(path.pending) <= MAX_PENDING_FRAMES
+        assert len(path.owed._frames) <= MAX_PENDING_FRAMES
         assert len(path.received._ranges) <= MAX_ACK_RANGES
         assert 0 <= path.recovery.in_flight == sum(sent.size for sent in path.recovery.sent)
         assert path.control.window > 0

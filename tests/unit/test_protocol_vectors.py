@@ -38,7 +38,7 @@ from plr.sidecar.core.engine.peers import RESTART_GAP_S
 from plr.sidecar.core.engine.verification_budget import ALL_LOOKS_AT_ONCE, ALL_LOOKS_PER_S, LOOKS_PER_S
 from plr.sidecar.core.link import path_table
 from plr.sidecar.core.message import reassembly
-from plr.sidecar.core.path import address, key_exchange
+from plr.sidecar.core.path import address, introductions, key_exchange
 from plr.sidecar.core.path.key_exchange import DEFAULT_LIMITS
 from plr.sidecar.core.path.keys import LATE_S, MAX_FAILED, PathKeys, make_path_keys
 from plr.sidecar.core.transfer import outbox
@@ -452,7 +452,7 @@ def test_the_numbers_on_the_page_are_those_of_the_code() -> None:
         f"late, {key_exchange.WAITS_S:.0f} s at most",
         f"at most {LOOKS_PER_S:.0f} a second are judged",
         f"{ALL_LOOKS_AT_ONCE:.0f} at once, and {ALL_LOOKS_PER_S:.0f} a second",
-        f"At most {path_table.MAX_INTRODUCTIONS} introductions over a path",
+        f"At most {introductions.MAX_INTRODUCTIONS} introductions over a path",
         f"at most {path_table.NEW_PATHS} paths at once in this way, and {path_table.NEW_PATHS_PER_S:.0f} a second",
         f"It has at most {path_table.MAX_PATHS_OF_A_PEER} there",
         f"go {path_table.UNPROVEN_BYTES} bytes in all and {path_table.UNPROVEN_BYTES_PER_S:.0f} bytes a second",

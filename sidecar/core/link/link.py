@@ -243,7 +243,7 @@ class Link:
         """Note the local address from which the kernel sends to the path's remote one, as `source_towards` says."""
         path = self._paths.get((path_id.peer, path_id.remote))
         if path is not None and path.remote is not None:
-            path.source = source_towards(path.remote)
+            path.note_source(source_towards(path.remote))
 
     def in_use(self, address: Address) -> bool:
         """Return whether a path that is not down leads to this address."""
@@ -340,7 +340,7 @@ class Link:
             return
         self._builder.identity = replace(self.identity, credential=credential)
         for path in self._paths.values():
-            path.renewed_at = now
+            path.renew(now)
 
     def _set_peers(self, peers: tuple[LinkPeer, ...], now: float) -> None:
         for path in self._table.set_peers(peers, now):

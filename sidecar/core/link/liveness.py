@@ -9,6 +9,7 @@ from plr.sidecar.core.seam.links import FinishedLost, FragmentsLost, PathChanged
 from plr.sidecar.core.wire.frame import KEY_ANSWER_TYPE, encode_key_answer
 
 if TYPE_CHECKING:
+    from plr.protos.model.ids import Address
     from plr.sidecar.core.link.mtu import LinkMtu
     from plr.sidecar.core.link.path_table import PathTable
     from plr.sidecar.core.message.outbound import OutboundMessage
@@ -74,7 +75,7 @@ class PathKeeper:
         answer = path.answer_keys(offer, now)
         if answer is not None:
             # The same offer may have come twice by now, and a datagram holds one answer.
-            path.pending = [encoded for encoded in path.pending if encoded[0] != KEY_ANSWER_TYPE]
+            path.owed.withdraw(KEY_ANSWER_TYPE)
             self._table.owe(path, encode_key_answer(answer))
 
     def keys_answered(self, path: Path, answer: frame.KeyAnswer, now: float) -> None:
@@ -119,12 +120,17 @@ class PathKeeper:
             else:
                 self._events.append(PathChanged(path.id, state, "silent"))
 
+    def follow(self, path: Path, source: Address, now: float) -> None:
+        """Lead the path to where its peer's datagrams come from now."""
+        if path.move(source, now):
+            self._mtu.route_changed(path, now)
+
     def _lead_back(self, path: Path, now: float) -> None:
         """Return to the last proven address: nobody answers at the newest datagrams' source."""
         before = path.address.before()
         if before is not None:
             self._table.stats.dropped["address_unproven"] += 1
-            self._mtu.moved(path, before, now)
+            self.follow(path, before, now)
             path.hasten_probe(now)
             self._table.dirty[path.id] = path
 
@@ -160,7 +166,7 @@ class PathKeeper:
         path.control.on_path_down()
         self._events.append(PathChanged(path.id, PathState.DOWN, reason))
         self._report_lost(path, path.recovery.give_up_all(forget=forget))
-        unsent = path.take_pending_finished()
+        unsent = path.owed.take_finished()
         if unsent:
             self._events.append(FinishedLost(path.id, unsent))
         for message, indices in path.queue.clear():

@@ -13,7 +13,6 @@ if TYPE_CHECKING:
     from collections import deque
     from collections.abc import Iterable
 
-    from plr.protos.model.ids import Address
     from plr.sidecar.core.path.in_flight import Sent
     from plr.sidecar.core.path.path import Path
     from plr.sidecar.core.seam.links import LinkEvent
@@ -48,13 +47,9 @@ class LinkMtu:
         if path.mtu.stop():
             self._fell(path)
 
-    def moved(self, path: Path, source: Address, now: float) -> None:
-        """Note that the peer's datagrams come from elsewhere: by another route, unless only a NAT changed its port."""
-        elsewhere = path.remote is not None and source[0] != path.remote[0]
-        path.address.move(source, now)
-        if elsewhere:
-            path.source = None
-        if elsewhere and path.mtu.timer is not None:
+    def route_changed(self, path: Path, now: float) -> None:
+        """Search again if a search began: the peer's datagrams come by another route."""
+        if path.mtu.timer is not None:
             self.start_afresh(path)
             self.search(path, now)
 

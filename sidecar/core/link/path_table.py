@@ -26,10 +26,6 @@ if TYPE_CHECKING:
     from plr.sidecar.core.path.key_exchange import KeyLimits
     from plr.sidecar.core.seam.links import LinkEvent, LinkPeer
 
-MAX_PENDING_FRAMES = 256
-"""Control frames waiting on one path besides FINISHED; only a dishonest peer makes us owe more."""
-MAX_PENDING_FINISHED = 8192
-"""FINISHED waiting on one path: as many as an honest peer has undelivered messages to us (`room.py`)."""
 MAX_PATHS_OF_A_PEER = 32
 """Paths of one peer, including those by which it introduces itself. A further introduction replaces a path that nothing
 authentic followed; if there is none, it waits until the control plane names that path."""
@@ -45,8 +41,6 @@ UNPROVEN_BYTES = 65_536
 UNPROVEN_BYTES_PER_S = 1200.0
 """... and the rate after that: one introduction a second. Announcing or listing others' addresses gets no more than
 this out of each link."""
-MAX_INTRODUCTIONS = 4
-"""Introductions on one path that wait for their answer; an honest peer repeats its own."""
 
 
 class PathTable:
@@ -188,21 +182,17 @@ class PathTable:
 
     def owe(self, path: Path, encoded: bytes, by: float = 0.0) -> None:
         """Queue an encoded control frame for the path's next datagram, which leaves by `by` (s)."""
-        if len(path.pending) >= MAX_PENDING_FRAMES:
+        if not path.owed.add(encoded, by):
             self.stats.dropped["pending_frames_full"] += 1
             return
-        path.pending.append(encoded)
-        path.pending_by = min(path.pending_by, by)
         self.dirty[path.id] = path
 
     def owe_finished(self, path: Path, number: int, by: float = 0.0) -> None:
         """Queue FINISHED for the peer's message with this number, as `owe` does."""
         # A sender that hears nothing asks again (`Outbox.ask_again`).
-        if len(path.finished) >= MAX_PENDING_FINISHED and number not in path.finished:
+        if not path.owed.add_finished(number, by):
             self.stats.dropped["pending_frames_full"] += 1
             return
-        path.finished[number] = None
-        path.pending_by = min(path.pending_by, by)
         self.dirty[path.id] = path
 
     def set_peers(self, peers: tuple[LinkPeer, ...], now: float) -> list[Path]:
@@ -219,16 +209,14 @@ class PathTable:
             crowd = sum(len(addresses) for _, addresses in peer.addresses)
             for remote, addresses in peer.addresses:
                 path = before.pop((peer.name, remote), None)
-                if path is not None and path.session == peer.session:
-                    path.candidates = addresses
-                else:
+                if path is None or path.session != peer.session:
                     if path is not None:
                         before[peer.name, remote] = path
                     path = self._new_path(peer, remote, addresses, first_number, now)
                     if path is None:
                         continue
                     self.dirty[path.id] = path
-                path.probing.crowd = crowd
+                path.announced(addresses, crowd)
                 self._enter(path)
         for key, path in list(before.items()):
             known = self.by_session.get(path.session)

@@ -68,7 +68,7 @@ class Pings:
         self._forget_old(now)
         sent = SentPing(path.probing.take_id(), ping.number, path.id, max(ping.size, LEAST_BYTES))
         self._out[sent.id] = sent
-        path.pings.append(sent)
+        path.ping(sent)
         return True
 
     def _problem(self, path: Path, ping: Ping, now: float) -> str:

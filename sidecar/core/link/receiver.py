@@ -15,7 +15,6 @@ from plr.protos.base.errors import DecodeError
 from plr.protos.model.ids import InterfaceId, Role, SessionId
 from plr.sidecar.core.base.values import PathState
 from plr.sidecar.core.crypto.aead import TAG_BYTES
-from plr.sidecar.core.link.path_table import MAX_INTRODUCTIONS
 from plr.sidecar.core.path.key_exchange import TooManyExchangesError
 from plr.sidecar.core.path.keys import MAX_FAILED
 from plr.sidecar.core.seam.links import (
@@ -189,7 +188,7 @@ class LinkOpener:
         keys.introduced = max(keys.introduced, number)
         if table.closing:
             return None  # an answer would bring us back to life at the peer
-        if len(path.introductions) >= MAX_INTRODUCTIONS:
+        if path.introductions.is_full:
             return "introductions_full"
         try:
             answer = None if offer is None else path.answer_keys(offer, now)
@@ -300,7 +299,7 @@ class LinkReader:
     def _heard(self, path: Path, source: Address, now: float, *, newest: bool) -> None:
         """Note an authentic datagram that is no duplicate; `newest`: sent after all that came before."""
         if newest and source != path.remote and not (self._leads and path.keeps_address(source)):
-            self._mtu.moved(path, source, now)
+            self._keeper.follow(path, source, now)
         self._keeper.follow_keys(path, now)
         self._table.dirty[path.id] = path
 

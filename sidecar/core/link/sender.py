@@ -10,7 +10,6 @@ from plr.protos.trust.pair_token import pair_token
 from plr.sidecar.core.base.timers import NEVER
 from plr.sidecar.core.base.values import PathState
 from plr.sidecar.core.crypto.aead import TAG_BYTES
-from plr.sidecar.core.link.path_table import MAX_PENDING_FRAMES
 from plr.sidecar.core.path.address import LEAST_CREDIT_BYTES
 from plr.sidecar.core.wire import frame
 from plr.sidecar.core.wire.frame import (
@@ -136,7 +135,7 @@ class DatagramBuilder:
 
     def build(self, path: Path, burst: Burst, now: float, *, probing: bool) -> bool:
         """Add what the path may send now; return False if the burst got full first. `probing` allows probes."""
-        if path.introductions:
+        if path.introductions.waiting:
             self._answer_introductions(path, burst, now)
         if path.state is PathState.DOWN and path.control_at <= now:
             # Answers go before our own questions: both count against what may go to an unproven address.
@@ -259,8 +258,7 @@ class DatagramBuilder:
         return size
 
     def _sent(self, path: Path, address: Address, size: int) -> None:
-        path.bytes_sent += size
-        path.address.went(address, size)
+        path.sent(address, size)
         self._stats.bytes["sent"] += size
 
     def _add_control(self, path: Path, control: list[bytes], burst: Burst, now: float) -> None:
@@ -271,9 +269,8 @@ class DatagramBuilder:
             taken = _fill(control, None if allowance is None else allowance - HEADER_BYTES - TAG_BYTES)
             if not taken:
                 path.address.block()
-                if len(control) > MAX_PENDING_FRAMES:
-                    self._stats.dropped["pending_frames_full"] += len(control) - MAX_PENDING_FRAMES
-                path.pending, path.pending_by = control[:MAX_PENDING_FRAMES], now
+                if over := path.owed.put_back(control, now):
+                    self._stats.dropped["pending_frames_full"] += over
                 return
             finished = _finished(taken)
             number = path.recovery.take_numbers()
@@ -314,8 +311,7 @@ class DatagramBuilder:
 
     def _answer_introductions(self, path: Path, burst: Burst, now: float) -> None:
         """Answer each introduction at its source, and ask back: the reply proves who it was, and moves the path."""
-        introductions, path.introductions = path.introductions, []
-        for address, probe_id, answer in introductions:
+        for address, probe_id, answer in path.introductions.take():
             frames = [
                 frame.encode_probe_reply(frame.ProbeReply(probe_id)),
                 frame.encode_probe(frame.Probe(path.probing.ask_back(now, address))),
@@ -340,7 +336,7 @@ class DatagramBuilder:
 
     def _add_pings(self, path: Path, burst: Burst, now: float) -> None:
         """Add the waiting pings, as `_add_mtu_probe` does; drop those of a path that has just gone down."""
-        pings, path.pings = path.pings, []
+        pings = path.take_pings()
         if path.state is PathState.DOWN or path.remote is None:
             return
         for ping in pings:

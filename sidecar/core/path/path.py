@@ -7,13 +7,14 @@ from typing import TYPE_CHECKING
 from plr.sidecar.core.base.timers import NEVER
 from plr.sidecar.core.base.values import PathId, PathState
 from plr.sidecar.core.path.address import PathAddress
-from plr.sidecar.core.path.congestion.rtt import RttEstimator
+from plr.sidecar.core.path.introductions import Introductions
+from plr.sidecar.core.path.owed import Owed
 from plr.sidecar.core.path.pmtu import PathMtu
 from plr.sidecar.core.path.probing import Probing
 from plr.sidecar.core.path.recovery import Recovery
+from plr.sidecar.core.path.report import PathReport
 from plr.sidecar.core.path.send_queue import SendQueue
-from plr.sidecar.core.seam.links import PathMeasured
-from plr.sidecar.core.wire.frame import Finished, encode_ack, encode_finished
+from plr.sidecar.core.wire.frame import encode_ack
 
 if TYPE_CHECKING:
     import random
@@ -24,6 +25,7 @@ if TYPE_CHECKING:
     from plr.sidecar.core.path.congestion.controller import CongestionController
     from plr.sidecar.core.path.keys import PathKeys
     from plr.sidecar.core.path.probing import SentPing
+    from plr.sidecar.core.seam.links import PathMeasured
     from plr.sidecar.core.wire.frame import KeyAnswer, KeyOffer
 
 DOWN_FACTOR = 4.0
@@ -33,10 +35,6 @@ DOWN_FLOOR_S = 0.5
 """... but not before this."""
 DOWN_WAIT_S = 2.0
 """A path with slow answers is down this long after its next answer is overdue, or one answer time after if sooner."""
-INTRODUCER_S = 5.0
-"""How long a peer that introduced itself twice from an address may still be found there."""
-MAX_RTT_SAMPLES = 512
-"""Round-trip times kept between two reports."""
 
 
 class Path:
@@ -44,25 +42,23 @@ class Path:
 
     __slots__ = (
         "_exchanges",
-        "_introduced_at",
-        "_introducer",
         "_make_control",
         "_oldest_at",
         "_rebound",
+        "_report",
         "_rng",
+        "_unproven",
         "_waiting_since",
         "address",
         "bytes_sent",
         "candidates",
         "control",
-        "finished",
         "id",
         "introductions",
         "keys",
         "mtu",
         "opening",
-        "pending",
-        "pending_by",
+        "owed",
         "pings",
         "probing",
         "queue",
@@ -70,15 +66,10 @@ class Path:
         "recovery",
         "remote_id",
         "renewed_at",
-        "reported_fates",
-        "reported_lost",
-        "reported_sent",
-        "rtts",
         "sealing",
         "session",
         "source",
         "state",
-        "unproven",
     )
 
     def __init__(
@@ -113,7 +104,7 @@ class Path:
         self.received = keys.received
         self.candidates = candidates
         self.address = PathAddress()
-        self.unproven = unproven
+        self._unproven = unproven
         self.source: str | None = None
         """The local address from which the kernel sends there, as far as the driver knows."""
         self.state = PathState.DOWN
@@ -122,24 +113,13 @@ class Path:
         self.control = make_control()
         self.mtu = PathMtu()
         self.queue = SendQueue()
-        self.introductions: list[tuple[Address, int, KeyAnswer | None]] = []
-        """Where the peer introduced itself from, the probe to answer there, and the answer to its offer."""
-        self.pending: list[bytes] = []
-        """Encoded control frames that wait for the next datagram ..."""
-        self.finished: dict[int, None] = {}
-        """... and messages to report FINISHED in it ..."""
-        self.pending_by = NEVER
-        """... which leaves by this moment (s); NEVER if none waits."""
+        self.introductions = Introductions()
+        self.owed = Owed()
         self.pings: list[SentPing] = []
         """Pings that wait to leave."""
         self.probing = Probing(now, rng, leads=leads)
-        self.rtts: list[float] = []
+        self._report = PathReport()
         self.bytes_sent = 0
-        self.reported_sent = 0
-        self.reported_lost = 0
-        self.reported_fates = (0, 0)
-        self._introduced_at = -NEVER
-        self._introducer: Address | None = None
         self.renewed_at: float | None = None
         """When our credential was renewed, until the peer answers an introduction with it."""
         self._waiting_since: float | None = None
@@ -167,6 +147,31 @@ class Path:
         if self.source is not None:
             return self.source in addresses
         return self.family in {6 if ":" in address else 4 for address in addresses}
+
+    def announced(self, candidates: tuple[Address, ...], crowd: int) -> None:
+        """Take the addresses at which the peer may be; it announced `crowd` of them over all its interfaces."""
+        self.candidates = candidates
+        self.probing.crowd = crowd
+
+    def note_source(self, source: str | None) -> None:
+        """Note the local address from which the kernel sends there; None while it is unknown."""
+        self.source = source
+
+    def move(self, source: Address, now: float) -> bool:
+        """Lead to where the peer's datagrams come from now.
+
+        Return whether that is by another route, rather than only by another port that a NAT gave the peer.
+        """
+        elsewhere = self.remote is not None and source[0] != self.remote[0]
+        self.address.move(source, now)
+        if elsewhere:
+            self.source = None
+        return elsewhere
+
+    def sent(self, address: Address, size: int) -> None:
+        """Count `size` bytes that went to `address`."""
+        self.bytes_sent += size
+        self.address.went(address, size)
 
     @property
     def probe_at(self) -> float:
@@ -196,8 +201,7 @@ class Path:
 
     def destinations(self, now: float, size: int) -> list[Address]:
         """Return where probes of `size` bytes that look for the peer go now."""
-        introducer = self._introducer if now < self._introduced_at + INTRODUCER_S else None
-        others = dict.fromkeys((self.remote, introducer))
+        others = dict.fromkeys((self.remote, self.introductions.introducer(now)))
         all_of_them = (*(one for one in others if one and one not in self.candidates), *self.candidates)
         return [one for one in all_of_them if self._may_look_at(one, now, size)]
 
@@ -206,7 +210,7 @@ class Path:
             return True
         if address == self.remote and address not in self.candidates:
             return (self.address.allowance or 0) >= size
-        return self.unproven.take(now, size)
+        return self._unproven.take(now, size)
 
     def keeps_address(self, source: Address) -> bool:
         """Return whether to ignore that an authentic datagram came from another known address of the peer.
@@ -218,20 +222,28 @@ class Path:
         return known and self.state is PathState.UP and not self._rebound
 
     def note_introduction(self, source: Address, probe_id: int, answer: KeyAnswer | None, now: float) -> None:
-        """Note that the peer introduced itself from here, wants a probe answered, and perhaps an offer of keys.
-
-        A peer that repeats it although it was answered cannot read the answer: it does not know yet that we restarted.
-        Behind a NAT it may be reachable there only, so our own introduction has to go there too.
-        """
-        self.introductions.append((source, probe_id, answer))
+        """Note that the peer introduced itself from here, wants a probe answered, and perhaps an offer of keys."""
+        self.introductions.note(source, probe_id, answer)
         if self.state is PathState.DOWN:
-            again = now < self._introduced_at + INTRODUCER_S
-            self._introducer, self._introduced_at = source if again else None, now
+            self.introductions.found_down(source, now)
 
     def ask(self, now: float, to: Address) -> int:
         """Return the id of a scheduled probe that leaves now to this address alone."""
         self.waits_for_answer(now)
         return self.probing.ask(now, to, sealed=self.state is not PathState.DOWN)
+
+    def ping(self, ping: SentPing) -> None:
+        """Let a ping leave."""
+        self.pings.append(ping)
+
+    def take_pings(self) -> list[SentPing]:
+        """Remove and return the pings that wait to leave."""
+        taken, self.pings = self.pings, []
+        return taken
+
+    def renew(self, now: float) -> None:
+        """Introduce ourselves again, with the renewed credential, until the peer answers that."""
+        self.renewed_at = now
 
     def offer_keys(self, now: float) -> KeyOffer | None:
         """Return the offer to send now, if new keys are due and we lead."""
@@ -270,7 +282,7 @@ class Path:
 
     def start_afresh(self, now: float) -> None:
         """Discard what was measured, since the route to the peer changed (RFC 9000 section 9.4)."""
-        self.recovery.rtt = RttEstimator()
+        self.recovery.forget_rtt()
         self.control = self._make_control()
         self.probing.forget()
         self._rebound = True
@@ -298,54 +310,22 @@ class Path:
         if self.address.is_blocked:
             return NEVER
         ack_at = self.received.ack_at
-        return self.pending_by if ack_at is None else min(ack_at, self.pending_by)
+        return self.owed.by if ack_at is None else min(ack_at, self.owed.by)
 
     def take_control(self, now: float) -> list[bytes]:
         """Remove and return the waiting control frames, including the acknowledgement that is owed."""
-        taken, self.pending = self.pending, []
-        taken += [encode_finished(Finished(number)) for number in self.take_pending_finished()]
+        taken = self.owed.take()
         if self.received.ack_at is not None:
             taken.append(encode_ack(*self.received.take_ack(now)))
-        self.pending_by = NEVER
         return taken
-
-    def take_pending_finished(self) -> tuple[int, ...]:
-        """Remove and return the messages to report FINISHED."""
-        finished = tuple(self.finished)
-        self.finished.clear()
-        return finished
 
     def note_rtt(self) -> None:
         """Keep the latest round-trip time for the next report."""
-        if len(self.rtts) < MAX_RTT_SAMPLES:
-            self.rtts.append(self.recovery.rtt.latest)
+        self._report.note_rtt(self.recovery.rtt.latest)
 
     def take_measured(self) -> PathMeasured | None:
         """Return what was measured since the last call; None if nothing was."""
-        recovery = self.recovery
-        sent, lost = recovery.total_sent, recovery.total_lost
-        if not self.rtts and sent == self.reported_sent:
-            return None
-        measured = PathMeasured(
-            self.id,
-            recovery.rtt.smoothed,
-            tuple(self.rtts),
-            sent - self.reported_sent,
-            lost - self.reported_lost,
-            *self._take_fates(),
-            policed=self.control.take_policed(),
-        )
-        self.rtts.clear()
-        self.reported_sent, self.reported_lost = sent, lost
-        return measured
-
-    def _take_fates(self) -> tuple[int, int]:
-        """Return how many datagrams arrived and were missing since the last call."""
-        arrived, missed = self.recovery.total_arrived, self.recovery.reordering.missed
-        told_arrived, told_missed = self.reported_fates
-        # More may have arrived late than went missing in the meantime: then the next report counts that many fewer.
-        self.reported_fates = arrived, max(missed, told_missed)
-        return arrived - told_arrived, max(0, missed - told_missed)
+        return self._report.take(self.id, self.recovery, self.control)
 
     def waits_for_answer(self, now: float) -> None:
         """Note that something left that wants an answer."""
@@ -368,7 +348,7 @@ class Path:
             self.probing.proven(now)
             return False
         self.state = PathState.UP
-        self._introduced_at, self._introducer = -NEVER, None
+        self.introductions.forget_introducer()
         self.probing.came_up(now)
         return True
 
@@ -399,7 +379,7 @@ class Path:
             self.state = PathState.UNSTABLE
         else:
             self.go_down()
-        self.probing.at = now
+        self.probing.ask_at_once(now)
         return self.state
 
     def go_down(self) -> None:

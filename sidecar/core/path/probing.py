@@ -222,6 +222,10 @@ class Probing:
         """Ask at once, unless that was just done: the peer shows up at an address that it has not proven."""
         self.at = min(self.at, max(now, self.last_at + FIRST_PROBE_S))
 
+    def ask_at_once(self, now: float) -> None:
+        """Probe at once: the path is silent."""
+        self.at = now
+
     def begin_again(self, now: float) -> None:
         """Probe at once, the first ones close together: the path may have come back."""
         self._gap = FIRST_PROBE_S

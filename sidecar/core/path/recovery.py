@@ -82,6 +82,10 @@ class Recovery:
         self._lost_at: float | None = None
         self._pto_count = 0
 
+    def forget_rtt(self) -> None:
+        """Measure the round trip from the beginning: the route changed."""
+        self.rtt = RttEstimator()
+
     @property
     def next_number(self) -> int:
         """The next packet number."""

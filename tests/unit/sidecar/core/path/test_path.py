@@ -11,7 +11,7 @@ from plr.sidecar.core.path.congestion.model_controller import ModelController
 from plr.sidecar.core.path.congestion.rtt import UNSTABLE_FLOOR_S
 from plr.sidecar.core.path.key_exchange import DEFAULT_LIMITS
 from plr.sidecar.core.path.keys import make_path_keys
-from plr.sidecar.core.path.path import DOWN_FACTOR, DOWN_FLOOR_S, MAX_RTT_SAMPLES, Path
+from plr.sidecar.core.path.path import DOWN_FACTOR, DOWN_FLOOR_S, Path
 from plr.sidecar.core.path.probing import FIRST_PROBE_S, IDLE_PROBE_S, MAX_PROBE_S
 from tests.support.builders import path, peer
 from tests.support.sessions import agree, session_of, with_credential
@@ -181,14 +181,6 @@ def test_only_what_was_asked_counts_as_an_answer_and_once() -> None:
     assert subject.recovery.rtt.latest == pytest.approx(4.0)
 
 
-def test_unanswered_probes_and_samples_are_capped() -> None:
-    subject = new()
-    for step in range(1000):
-        ask(subject, 100.0 + step)
-        subject.note_rtt()
-    assert len(subject.rtts) == MAX_RTT_SAMPLES
-
-
 def test_probes_go_to_every_candidate_until_the_path_is_up() -> None:
     subject = new()
     assert destinations(subject) == (HERE, THERE)
@@ -214,3 +206,14 @@ def test_after_a_rebinding_every_candidate_is_asked_until_one_answers() -> None:
     assert subject.answered_probe(ask(subject, 101.0), 101.02)
     assert subject.made_progress(101.02)
     assert destinations(subject) == (ELSEWHERE,)
+
+
+def test_a_path_that_moves_says_whether_that_is_by_another_route() -> None:
+    subject = new()
+    assert not subject.move(HERE, 100.0), "there was none before"
+    subject.note_source("192.0.2.100")
+    assert not subject.move((HERE[0], 9), 101.0), "a NAT changed its port"
+    assert subject.source == "192.0.2.100"
+    assert subject.move(THERE, 102.0)
+    assert subject.remote == THERE
+    assert subject.source is None
