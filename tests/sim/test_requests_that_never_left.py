@@ -28,7 +28,7 @@ def backlog(size: int = 60_000, lifetime_s: float = 30.0) -> tuple[Mesh, Node, N
         robot.submit(number.to_bytes(4, "big") + bytes(size))
     mesh.run(1.0)
     requests = robot.engine._requests._requests.of(SERVICE)
-    unsent = {request.id for request in requests if not any(copy.message.begun for copy in request.copies)}
+    unsent = {request.id for request in requests if not any(copy.message.symbols.begun for copy in request.copies)}
     assert len(unsent) > COUNT / 2
     return mesh, robot, near, far, set(unsent)
 

@@ -14,7 +14,7 @@ from plr.sidecar.core.crypto.aead import TAG_BYTES
 from plr.sidecar.core.link.link import Link
 from plr.sidecar.core.link.memory import LinkMemory
 from plr.sidecar.core.link.sender import LinkIdentity
-from plr.sidecar.core.message.outbound import OutboundMessage
+from plr.sidecar.core.message.symbols import MessageSymbols
 from plr.sidecar.core.path.key_exchange import DEFAULT_LIMITS
 from plr.sidecar.core.path.keys import PathKeys, make_path_keys
 from plr.sidecar.core.path.pmtu import HEADERS_V4
@@ -61,14 +61,11 @@ def message(
     priority: Priority = Priority.NORMAL,
     deadline: float = 10.0,
     expires: float = 20.0,
-    over: PathId | None = None,
-    siblings: list[OutboundMessage] | None = None,
-) -> OutboundMessage:
+    siblings: list[MessageSymbols] | None = None,
+) -> MessageSymbols:
     data = random.Random(number).randbytes(size)
     content = Encoded(b"", data)
-    return OutboundMessage(
-        number, over or path(), content, priority=priority, deadline=deadline, expires=expires, siblings=siblings
-    )
+    return MessageSymbols(number, content, priority=priority, deadline=deadline, expires=expires, siblings=siblings)
 
 
 def request_id(number: int) -> RequestId:

@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from plr.sidecar.core.base.slices import Backlog, Step
     from plr.sidecar.core.base.values import PathId, RequestId
     from plr.sidecar.core.cloud.executions import Reply
-    from plr.sidecar.core.message.outbound import OutboundMessage
+    from plr.sidecar.core.message.symbols import MessageSymbols
     from plr.sidecar.core.rules.service_rule import Rules
     from plr.sidecar.core.seam.stats import EngineStats
     from plr.sidecar.core.transfer.outbox import Outbox
@@ -67,7 +67,7 @@ class _Answer:
     """Copies it was not sent to yet, and the paths they came by."""
     sent: dict[int, PathId] = field(default_factory=dict)
     """Copies it was sent to, and the paths they came by."""
-    messages: list[OutboundMessage] = field(default_factory=list)
+    messages: list[MessageSymbols] = field(default_factory=list)
     """Messages that carry a large answer: siblings, so that overloaded paths share it."""
 
     @property

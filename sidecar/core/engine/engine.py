@@ -386,8 +386,8 @@ class Engine:
             case FinishedLost(path, numbers) if path.peer in self.peers:
                 self._inbound.on_finished_lost(path.peer, numbers, self.routes.best_to(path.peer))
             case FragmentsLost():
-                if event.timed_out and not event.message.over:
-                    self._requests.on_copy_lost(event.message, now)
+                if event.timed_out and (message := self._outbox.under_way(event.message)) is not None:
+                    self._requests.on_copy_lost(message, now)
                 self._outbox.on_lost(event, now)
             case PathMeasured() if self._knows(event.path):
                 self.routes.set_rtt(event.path, event.smoothed_rtt_s)

@@ -240,7 +240,7 @@ class RevocationExchange:
 
     def _send_lists(self, now: float) -> None:
         self._sending = [message for message in self._sending if not message.newest.over]
-        room = MAX_SENDING_BYTES - sum(message.total for message in self._sending)
+        room = MAX_SENDING_BYTES - sum(message.symbols.total for message in self._sending)
         content = encode_message(RevocationLists(self._lists))
         for peer in list(self._waiting):
             if room < content.size:

@@ -55,7 +55,7 @@ if TYPE_CHECKING:
     from plr.protos.model.ids import Address, NodeName
     from plr.sidecar.core.link.pinging import Pong
     from plr.sidecar.core.link.sender import LinkIdentity
-    from plr.sidecar.core.message.outbound import OutboundMessage
+    from plr.sidecar.core.message.symbols import MessageSymbols
     from plr.sidecar.core.path.path import Path
     from plr.sidecar.core.path.view import PathView
     from plr.sidecar.core.seam.links import LinkPeer
@@ -116,7 +116,7 @@ class Link:
         """Carry out a command of the engine."""
         match command:
             case Send(path_id, message):
-                path = self._live_path(path_id, message, range(message.symbols))
+                path = self._live_path(path_id, message, range(len(message)))
                 if path is not None:
                     path.queue.add(message)
             case Resend(path_id, message, indices):
@@ -282,7 +282,7 @@ class Link:
     def _paths_to(self, peers: Iterable[NodeName]) -> list[Path]:
         return [path for peer in peers for path in self._table.to(peer)]
 
-    def _live_path(self, path_id: PathId, message: OutboundMessage, indices: Iterable[int]) -> Path | None:
+    def _live_path(self, path_id: PathId, message: MessageSymbols, indices: Iterable[int]) -> Path | None:
         """Return the path if it can carry the message; otherwise hand the symbols back as lost.
 
         The engine may have an old state of the path: it is told again, so that it does not send them here once more.

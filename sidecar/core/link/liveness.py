@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from plr.protos.model.ids import Address
     from plr.sidecar.core.link.mtu import LinkMtu
     from plr.sidecar.core.link.path_table import PathTable
-    from plr.sidecar.core.message.outbound import OutboundMessage
+    from plr.sidecar.core.message.symbols import MessageSymbols
     from plr.sidecar.core.path.in_flight import Sent
     from plr.sidecar.core.path.path import Path
     from plr.sidecar.core.wire import frame
@@ -187,7 +187,7 @@ class PathKeeper:
         self._report_lost(path, lost, timed_out=timed_out)
 
     def _report_lost(self, path: Path, lost: list[Sent], *, timed_out: bool = False) -> None:
-        by_message: dict[int, tuple[OutboundMessage, list[int]]] = {}
+        by_message: dict[int, tuple[MessageSymbols, list[int]]] = {}
         finished: list[int] = []
         for run in lost:
             if run.message is not None:

@@ -29,7 +29,7 @@ from plr.sidecar.core.wire.introduction import INTRODUCTION_BYTES, encode_introd
 if TYPE_CHECKING:
     from plr.protos.model.ids import Address, InterfaceId, InterfaceName, NodeName, SessionId
     from plr.protos.trust.credential import SessionCredential
-    from plr.sidecar.core.message.outbound import OutboundMessage
+    from plr.sidecar.core.message.symbols import MessageSymbols
     from plr.sidecar.core.path.path import Path
     from plr.sidecar.core.path.send_queue import Run
     from plr.sidecar.core.seam.stats import LinkStats
@@ -202,7 +202,7 @@ class DatagramBuilder:
         return self._add_symbols(path, remote, run.message, range(run.first, end), burst, now)
 
     def _add_symbols(
-        self, path: Path, remote: Address, message: OutboundMessage, indices: range, burst: Burst, now: float
+        self, path: Path, remote: Address, message: MessageSymbols, indices: range, burst: Burst, now: float
     ) -> int:
         """Build a datagram for each symbol, all but the last equally long, and seal each in place."""
         count = len(indices)
@@ -362,7 +362,7 @@ class DatagramBuilder:
         return clear + sealed
 
 
-def _left_us(path: Path, message: OutboundMessage, now: float) -> int:
+def _left_us(path: Path, message: MessageSymbols, now: float) -> int:
     """Return how long the message will be of use on arrival.
 
     One way counts as half a round trip. If that is too much, the way back is longer, and the answer would come no

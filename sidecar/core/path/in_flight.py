@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, NamedTuple
 
 if TYPE_CHECKING:
-    from plr.sidecar.core.message.outbound import OutboundMessage
+    from plr.sidecar.core.message.symbols import MessageSymbols
 
 
 class Sent(NamedTuple):
@@ -19,7 +19,7 @@ class Sent(NamedTuple):
     """Bytes of each datagram but the last."""
     last: int
     """Bytes of the last datagram."""
-    message: OutboundMessage | None = None
+    message: MessageSymbols | None = None
     """The message whose symbols they carry, one each, in order."""
     symbol: int = 0
     """The first symbol."""

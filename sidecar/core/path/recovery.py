@@ -17,7 +17,7 @@ from plr.sidecar.core.path.reordering import Reordering
 if TYPE_CHECKING:
     import random
 
-    from plr.sidecar.core.message.outbound import OutboundMessage
+    from plr.sidecar.core.message.symbols import MessageSymbols
     from plr.sidecar.core.wire.frame import AckFrame
 
 PTO_DATAGRAMS = 2
@@ -114,7 +114,7 @@ class Recovery:
         now: float,
         segment: int,
         last: int,
-        message: OutboundMessage,
+        message: MessageSymbols,
         index: int,
         finished: tuple[int, ...] = (),
     ) -> None:

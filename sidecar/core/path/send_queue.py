@@ -8,7 +8,7 @@ after those: after an outage the pace is low at first, and a request made then m
 the backlog. A message that cannot even be answered before it expires goes last, as the pace may rise; when it does, the
 message may be fresh again. No priority starves: while a lower one waits, it gets one symbol in SHARE.
 
-The copies of one request on several paths are in one race (`OutboundMessage.siblings`). The path that sends a symbol
+The copies of one request on several paths are in one race (`MessageSymbols.siblings`). The path that sends a symbol
 says when it expects the answer. Until that is overdue, the other paths send other messages first, if any wait. So where
 one carrier cannot bear the load, carriers share it instead of all sending the same symbols; elsewhere all copies leave
 at once. Copies of small requests always do.
@@ -28,7 +28,7 @@ from plr.sidecar.core.wire.frame import FRAGMENT_OVERHEAD_BYTES
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
-    from plr.sidecar.core.message.outbound import OutboundMessage
+    from plr.sidecar.core.message.symbols import MessageSymbols
 
 HASTE = 1.25
 """A message that has not begun to leave is late when this many times its sending time no longer fits: a message that
@@ -44,11 +44,12 @@ SMALL = 0.1
 class Turn:
     """One message on one path."""
 
-    __slots__ = ("again", "begun", "message", "next")
+    __slots__ = ("_end", "again", "begun", "message", "next")
 
-    def __init__(self, message: OutboundMessage) -> None:
+    def __init__(self, message: MessageSymbols) -> None:
         self.message = message
         self.next = 0
+        self._end = len(message)
         self.again: deque[int] = deque()
         """Symbols to be sent once more."""
         self.begun = False
@@ -66,7 +67,7 @@ class Turn:
                     again.popleft()
                     end += 1
                 return first, end - first
-        last = self.message.symbols
+        last = self._end
         first = self.next
         while first < last and not needs(first):
             first += 1
@@ -79,7 +80,7 @@ class Turn:
 
     def remaining(self) -> tuple[int, ...]:
         """Return the symbols that have not left and still have to."""
-        return tuple(filter(self.message.needs, (*self.again, *range(self.next, self.message.symbols))))
+        return tuple(filter(self.message.needs, (*self.again, *range(self.next, self._end))))
 
     def can_end_by(self, end: float, now: float, pace: float, round_trip_s: float) -> bool:
         """Return whether its last symbol can be answered before `end` at this pace (bytes a second; 0: unknown)."""
@@ -116,7 +117,7 @@ class Turn:
         return None
 
     def _sending_s(self, pace: float) -> float:
-        return (len(self.again) + self.message.symbols - self.next) * self.message.symbol / pace
+        return (len(self.again) + self._end - self.next) * self.message.symbol / pace
 
 
 PURGE_AT = 64
@@ -132,7 +133,7 @@ MAX_RUN_BYTES = 65_000
 class Run(NamedTuple):
     """Consecutive symbols of one message, to be sent in sequence."""
 
-    message: OutboundMessage
+    message: MessageSymbols
     first: int
     symbols: int
 
@@ -188,17 +189,17 @@ class SendQueue:
     def __len__(self) -> int:
         return len(self._entries)
 
-    def add(self, message: OutboundMessage) -> None:
+    def add(self, message: MessageSymbols) -> None:
         """Queue all symbols of a message."""
         if message.number not in self._entries:
             self._insert(Turn(message))
 
-    def resend(self, message: OutboundMessage, indices: Iterable[int]) -> None:
+    def resend(self, message: MessageSymbols, indices: Iterable[int]) -> None:
         """Queue these symbols of a message again, before its others."""
         entry = self._entries.get(message.number)
         if entry is None:
             entry = Turn(message)
-            entry.next = message.symbols
+            entry.next = len(message)
             self._insert(entry)
         entry.again.extend(indices)
 
@@ -336,7 +337,7 @@ class SendQueue:
     def _drop(self, heap: list[_Entry]) -> None:
         del self._entries[heapq.heappop(heap)[2].message.number]
 
-    def clear(self) -> list[tuple[OutboundMessage, tuple[int, ...]]]:
+    def clear(self) -> list[tuple[MessageSymbols, tuple[int, ...]]]:
         """Empty the queue and return each message with its symbols that did not leave."""
         left = [(entry.message, entry.remaining()) for entry in self._entries.values()]
         for entry in self._entries.values():

@@ -10,7 +10,7 @@ if TYPE_CHECKING:
     from plr.protos.trust.credential import SessionCredential
     from plr.sidecar.core.base.values import PathId, PathState
     from plr.sidecar.core.crypto.key_schedule import PairKeys
-    from plr.sidecar.core.message.outbound import OutboundMessage
+    from plr.sidecar.core.message.symbols import MessageSymbols
     from plr.sidecar.core.wire.frame import Fragment
 
 
@@ -123,7 +123,7 @@ class Send:
     """Send a whole message over this path."""
 
     path: PathId
-    message: OutboundMessage
+    message: MessageSymbols
 
 
 @dataclass(frozen=True, slots=True)
@@ -131,7 +131,7 @@ class Resend:
     """Send these symbols of a message over this path, which need not be the one that lost them."""
 
     path: PathId
-    message: OutboundMessage
+    message: MessageSymbols
     indices: tuple[int, ...]
 
 
@@ -199,7 +199,7 @@ class FragmentsLost:
     """These symbols of a message did not arrive over this path."""
 
     path: PathId
-    message: OutboundMessage
+    message: MessageSymbols
     indices: tuple[int, ...]
     timed_out: bool = False
     """Nothing at all was heard in time: the path itself is suspect, not one datagram."""

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 from plr.sidecar.core.base.slices import in_groups
 from plr.sidecar.core.message.outbound import OutboundMessage
 from plr.sidecar.core.message.repair import repair_symbols, worth_a_copy
+from plr.sidecar.core.message.symbols import MessageSymbols
 from plr.sidecar.core.seam.links import FragmentsLost, Resend, Send, SendAbandon
 from plr.sidecar.core.transfer.room import Room
 from plr.sidecar.core.wire.frame import symbol_count
@@ -91,7 +92,7 @@ class Outbox:
 
     def answer_has_begun(self, peer: NodeName, request: RequestId) -> bool:
         """Return whether some of an answer that is under way may have left."""
-        return any(message.begun for message in self._answers.get((peer, request), ()))
+        return any(message.symbols.begun for message in self._answers.get((peer, request), ()))
 
     def send(
         self,
@@ -104,7 +105,7 @@ class Outbox:
         fec: Redundancy = None,
         answers: RequestId | None = None,
         copy_of: RequestId | None = None,
-        siblings: list[OutboundMessage] | None = None,
+        siblings: list[MessageSymbols] | None = None,
     ) -> OutboundMessage | None:
         """Send a message over `path`; return None (counted) if there is no room.
 
@@ -121,19 +122,17 @@ class Outbox:
         repairs = repair_symbols(count, fec, self._routes.loss(path))
         if repairs and not self._room.fits(path.peer, content.size, (count + repairs) * symbol):
             repairs = 0
-        message = OutboundMessage(
+        symbols = MessageSymbols(
             self._take_number(),
-            path,
             content,
             priority=priority,
             deadline=deadline,
             expires=expires,
             symbol=symbol,
             repairs=repairs,
-            answers=answers,
-            copy_of=copy_of,
             siblings=siblings,
         )
+        message = OutboundMessage(path, symbols, answers=answers, copy_of=copy_of)
         self._enter(message)
         return message
 
@@ -148,10 +147,10 @@ class Outbox:
         if message.answers is not None:
             self._answers.setdefault((message.peer, message.answers), []).append(message)
         self._room.take(message)
-        self._command(Send(message.path, message))
-        if not message.repairs and worth_a_copy(1, self._routes.loss(message.path)):
+        self._command(Send(message.path, message.symbols))
+        if not message.symbols.repairs and worth_a_copy(1, self._routes.loss(message.path)):
             # It leaves before the others, so a burst does not take both.
-            self._send_copies(message, message.path, (message.count - 1,))
+            self._send_copies(message, message.path, (message.symbols.count - 1,))
 
     def on_finished(self, peer: NodeName, number: int) -> OutboundMessage | None:
         """Remove a message that the peer holds; None if it is not one of the peer's messages, or was already over."""
@@ -178,7 +177,8 @@ class Outbox:
     def drop(self, message: OutboundMessage) -> None:
         """Stop sending a message, in whatever it was cut into, and tell a peer that has some of it."""
         message = message.newest
-        unfinished = message.begun and not message.over and message.count > 1
+        symbols = message.symbols
+        unfinished = symbols.begun and not symbols.over and symbols.count > 1
         self._remove(message)
         if unfinished:
             path = self._routes.best_to(message.peer)
@@ -186,7 +186,7 @@ class Outbox:
                 self._command(SendAbandon(path, message.number))
 
     def _remove(self, message: OutboundMessage) -> None:
-        message.over = True
+        message.end()
         if self._messages.pop(message.number, None) is not None:
             of_peer = self._by_peer.get(message.peer, {})
             of_peer.pop(message.number, None)
@@ -214,23 +214,28 @@ class Outbox:
         """Drop what was meant for a peer whose session is over. Return the remaining steps."""
         messages = self._by_peer.pop(peer, {}).values()
         for message in messages:
-            message.over = True
+            message.end()
         self._parked.pop(peer, None)
         return in_groups(self._remove, messages)
 
+    def under_way(self, symbols: MessageSymbols) -> OutboundMessage | None:
+        """Return the message that these are the symbols of; None if it is over."""
+        message = None if symbols.over else self._messages.get(symbols.number)
+        return message if message is not None and message.symbols is symbols else None
+
     def on_lost(self, event: FragmentsLost, now: float) -> None:
         """Send lost symbols again over the best path to that peer; without one, keep them until there is one."""
-        message = event.message
-        if message.over:
+        message = self.under_way(event.message)
+        if message is None:
             return
-        if message.expires <= now:
+        if event.message.expires <= now:
             self.drop(message)
             return
         indices = message.lost(event.indices)
         if not indices:
             return
         path = self._routes.best_to(
-            message.peer, avoid=event.path if event.timed_out else None, size=message.datagram_bytes
+            message.peer, avoid=event.path if event.timed_out else None, size=message.symbols.datagram_bytes
         )
         if path is None:
             self._parked.setdefault(message.peer, {})[message.number] = message
@@ -238,18 +243,18 @@ class Outbox:
             self._resend(message, path, indices)
 
     def _resend(self, message: OutboundMessage, path: PathId, indices: tuple[int, ...]) -> None:
-        if message.datagram_bytes > self._routes.max_datagram(path):
+        if message.symbols.datagram_bytes > self._routes.max_datagram(path):
             self._cut_again(message, path)
             return
         message.interfaces.add(path.interface)
-        self._command(Resend(path, message, indices))
+        self._command(Resend(path, message.symbols, indices))
         if worth_a_copy(len(indices), self._routes.loss(path)):
-            self._send_copies(message, self._routes.beside(path, message.datagram_bytes) or path, indices)
+            self._send_copies(message, self._routes.beside(path, message.symbols.datagram_bytes) or path, indices)
 
     def _send_copies(self, message: OutboundMessage, path: PathId, indices: tuple[int, ...]) -> None:
         message.interfaces.add(path.interface)
         message.copied(indices)
-        self._command(Resend(path, message, indices))
+        self._command(Resend(path, message.symbols, indices))
 
     def _cut_again(self, message: OutboundMessage, path: PathId) -> None:
         """Send the whole message again in smaller symbols: no path carries its present ones any more."""
@@ -275,7 +280,7 @@ class Outbox:
 
     def _send_rest(self, message: OutboundMessage, now: float) -> None:
         """Send all that is missing of a message, even if in flight."""
-        self.on_lost(FragmentsLost(message.path, message, message.give_up()), now)
+        self.on_lost(FragmentsLost(message.path, message.symbols, message.give_up()), now)
 
     def ask_again(self) -> None:
         """Ask about messages that the peer seems to have in full, but has not reported FINISHED.
@@ -287,17 +292,18 @@ class Outbox:
         messages = list(islice(self._messages.values(), start, start + LOOKED_AT_ONCE))
         self._looked_at = start + LOOKED_AT_ONCE if len(messages) == LOOKED_AT_ONCE else 0
         for message in messages:
-            if message.acked.count(1) < message.count:
+            if message.symbols.arrived < message.symbols.count:
                 message.unreported = False
             elif not message.unreported:
                 message.unreported = True
-            elif (path := self._routes.best_to(message.peer, size=message.datagram_bytes)) is not None:
-                message.acked[0] = 0
+            elif (path := self._routes.best_to(message.peer, size=message.symbols.datagram_bytes)) is not None:
+                message.symbols.ask_again()
                 self._resend(message, path, (0,))
 
     def expired(self, now: float) -> list[Step]:
         """Return the steps that drop expired messages."""
-        return in_groups(self._expire, [message for message in self._messages.values() if message.expires <= now])
+        expired = [message for message in self._messages.values() if message.symbols.expires <= now]
+        return in_groups(self._expire, expired)
 
     def _expire(self, message: OutboundMessage) -> None:
         if not message.over:

@@ -91,8 +91,8 @@ class Adaptive:
             return math.inf
         if copy.forecast_s is None:
             copy.forecast_s = self.expected_s(request, copy.path, now)
-        message = copy.message.newest
-        arrived = message.count if message.over else min(message.acked.count(1), message.count)
+        symbols = copy.message.newest.symbols
+        arrived = symbols.count if symbols.over else min(symbols.arrived, symbols.count)
         if arrived > copy.arrived:
             copy.arrived, copy.progress_at = arrived, now
         # The last round trip measured may be out of date: answers show it first.
@@ -100,15 +100,15 @@ class Adaptive:
         answer_s = min(rtt_s + self._paces.processing_s(request.service, copy.path), copy.forecast_s)
         silence_s = now - copy.progress_at
         patience_s = PATIENCE_ROUNDS * rtt_s + self._step(request)
-        if message.over:
+        if symbols.over:
             left_s = max(answer_s - silence_s, 0.0)
             patience_s += answer_s
         elif copy.arrived:
-            sending_s = max(copy.progress_at - copy.sent_at - rtt_s, LEAST_STEP_S) * message.count / copy.arrived
+            sending_s = max(copy.progress_at - copy.sent_at - rtt_s, LEAST_STEP_S) * symbols.count / copy.arrived
             # The first symbols show little: an idle path starts slowly.
             believed = min(1.0, (now - copy.sent_at) / copy.forecast_s)
             sending_s = believed * sending_s + (1.0 - believed) * max(copy.forecast_s - answer_s, 0.0)
-            left_s = sending_s * (1.0 - copy.arrived / message.count) + answer_s
+            left_s = sending_s * (1.0 - copy.arrived / symbols.count) + answer_s
         else:
             left_s = max(copy.forecast_s - (now - copy.sent_at), answer_s)
         if state is PathState.UNSTABLE:

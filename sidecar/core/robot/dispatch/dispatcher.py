@@ -227,7 +227,7 @@ class Dispatching:
         self.records.note(request, now)
         if self._budgets and any(copy.in_time for copy in request.copies):
             paths = (*request.withheld, *(copy.path for copy in request.copies))
-            self._budgets.earn(request.copies[0].message.total, {path.interface for path in paths})
+            self._budgets.earn(request.copies[0].message.symbols.total, {path.interface for path in paths})
 
     def encode(self, request: Request, payload: bytes, now: float) -> Encoded:
         """Return the next copy as a message; all copies are equally long."""

@@ -12,6 +12,7 @@ if TYPE_CHECKING:
     from plr.protos.model.ids import InterfaceName, NodeName, ServiceName
     from plr.sidecar.core.base.values import PathId, RequestId
     from plr.sidecar.core.message.outbound import OutboundMessage
+    from plr.sidecar.core.message.symbols import MessageSymbols
     from plr.sidecar.core.rules.service_rule import ServiceRule
 
 HEDGE_AT = 0.5
@@ -103,7 +104,7 @@ class Request:
     held: int = field(init=False)
     """Bytes of its payload, which stay in memory until its last copy has ended."""
     copies: list[Copy] = field(default_factory=list)
-    messages: list[OutboundMessage] = field(default_factory=list)
+    messages: list[MessageSymbols] = field(default_factory=list)
     """Messages of the copies that may leave the request to each other: siblings."""
     withheld: tuple[PathId, ...] = ()
     """Further paths that its mapping names, the best first: for trouble, or to explore."""

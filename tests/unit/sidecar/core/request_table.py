@@ -92,9 +92,9 @@ class Table:
         """What was cancelled where; those messages count as delivered."""
         found = []
         for message in list(self.outbox._messages.values()):
-            content = decode_message(memoryview(b"".join(message.content)))
+            content = decode_message(memoryview(b"".join(message.symbols.content)))
             if isinstance(content, CancelMessage):
-                assert message.priority is Priority.HIGH
+                assert message.symbols.priority is Priority.HIGH
                 found.append((message.path, content.request_id))
                 self.outbox.drop(message)
         return found

@@ -13,8 +13,8 @@ from plr.protos.model.members import PeerSet, ServiceOffer
 from plr.sidecar.core.base.values import Priority
 from plr.sidecar.core.engine.engine import EngineConfig
 from plr.sidecar.core.message.decoding import Decoding
-from plr.sidecar.core.message.outbound import OutboundMessage
 from plr.sidecar.core.message.partial import Partial
+from plr.sidecar.core.message.symbols import MessageSymbols
 from plr.sidecar.core.seam.application import ExecuteRequest
 from plr.sidecar.core.seam.links import FragmentsReceived
 from plr.sidecar.core.wire.frame import Fragment
@@ -53,10 +53,10 @@ def test_messages_are_decoded_on_no_interfaces_thread_while_nothing_is_locked(mo
     payload = random.Random(1).randbytes(5000)
     request = RequestMessage(request_id(1), 0, Priority.NORMAL, 1.0, 10.0, ECHO, TYPE, payload)
     over = path(InterfaceName("eth0"), "robot")
-    message = OutboundMessage(1, over, encode_message(request), deadline=1.0, expires=2.0, repairs=1)
+    message = MessageSymbols(1, encode_message(request), deadline=1.0, expires=2.0, repairs=1)
     fragments = [
         Fragment(1, message.total, message.symbol, index, memoryview(message.symbol_data(index)))
-        for index in range(1, message.symbols)
+        for index in range(1, len(message))
     ]
 
     run_slice = Decoding.run_slice

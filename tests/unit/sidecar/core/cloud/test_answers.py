@@ -23,7 +23,7 @@ from tests.support.builders import ECHO, path, request_id, rule
 
 if TYPE_CHECKING:
     from plr.sidecar.core.base.values import PathId
-    from plr.sidecar.core.message.outbound import OutboundMessage
+    from plr.sidecar.core.message.symbols import MessageSymbols
     from plr.sidecar.core.wire.messages import Message
 
 pytestmark = pytest.mark.audit("dp-1")
@@ -69,14 +69,14 @@ class Cloud:
     def finish(self, number: int, copy: int = 0) -> None:
         """The robot got this, and what comes of it."""
         for message in list(self.outbox._messages.values()):
-            content = decoded(message)
+            content = decoded(message.symbols)
             if number_of(content) == number and copy_of(content) == copy:
                 self.outbox.on_finished(ROBOT, message.number)
         self.answers.on_room(1.0)
 
 
-def decoded(message: OutboundMessage) -> Message:
-    return decode_message(memoryview(b"".join(message.content)))
+def decoded(symbols: MessageSymbols) -> Message:
+    return decode_message(memoryview(b"".join(symbols.content)))
 
 
 def number_of(message: Message) -> int:
@@ -159,7 +159,7 @@ def test_answers_that_only_further_copies_wait_for_go_before_one_that_nobody_has
     assert cloud.stats.dropped["answers_full"] == 1
     (told,) = cloud.sent()
     assert told == (6, 0, WLAN)
-    assert decoded(list(cloud.outbox._messages.values())[-1]).reason is RejectReason.FORGOTTEN  # type: ignore[union-attr]
+    assert decoded(list(cloud.outbox._messages.values())[-1].symbols).reason is RejectReason.FORGOTTEN  # type: ignore[union-attr]
 
 
 @pytest.mark.parametrize("begun", [True, False])
@@ -167,7 +167,7 @@ def test_what_has_not_begun_to_leave_is_given_up_before_its_time_is_over(begun: 
     cloud = Cloud()
     cloud.answer(1, LARGE, WLAN, WWAN)
     for message in cloud.outbox._messages.values():
-        message.begun = begun
+        message.symbols.begun = begun
     assert cloud.answers.next_timer() == 9.0
     cloud.sent()
     cloud.answers.handle_timer(9.0)

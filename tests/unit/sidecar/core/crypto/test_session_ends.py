@@ -96,7 +96,7 @@ def silent() -> Sidecar:
     assert answers_under_way(sidecar) == 1
     sidecar.change(PathState.DOWN)
     (answer,) = sidecar.engine._outbox._messages.values()
-    sidecar.engine.on_link_event(FragmentsLost(answer.path, answer, (0,)), 0.9)
+    sidecar.engine.on_link_event(FragmentsLost(answer.path, answer.symbols, (0,)), 0.9)
     sidecar.view(version=2)
     assert ROBOT not in sidecar.engine.peers
     return sidecar

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from plr.sidecar.core.message.outbound import OutboundMessage
+from plr.sidecar.core.message.symbols import MessageSymbols
 from plr.sidecar.core.path.received import MAX_ACK_DELAY_S
 from plr.sidecar.core.seam.links import (
     FinishedLost,
@@ -115,7 +115,7 @@ def test_expired_messages_are_not_sent_and_counted() -> None:
     assert bench.link.stats.dropped["expired"] == 1
 
 
-class EndedMeanwhile(OutboundMessage):
+class EndedMeanwhile(MessageSymbols):
     """The engine ends it while its link cuts it."""
 
     __slots__ = ()
@@ -131,7 +131,7 @@ class EndedMeanwhile(OutboundMessage):
 def test_what_is_ended_while_it_is_cut_does_not_leave_and_what_is_owed_does(size: int) -> None:
     bench = up()
     bench.execute(SendFinished(PATH, 7))
-    ended = EndedMeanwhile(1, PATH, Encoded(b"", bytes(size)), deadline=10.0, expires=20.0)
+    ended = EndedMeanwhile(1, Encoded(b"", bytes(size)), deadline=10.0, expires=20.0)
     bench.execute(Send(PATH, ended))
     assert [type(item) for item in bench.frames(bench.sent())] == [Finished]
     assert ended.begun

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from plr.sidecar.core.message.outbound import OutboundMessage
+from plr.sidecar.core.message.symbols import MessageSymbols
 from plr.sidecar.core.path.pmtu import PROBE_TIMEOUT_S
 from plr.sidecar.core.seam.links import FragmentsLost, PathMtuChanged, Send, SetMtu
 from plr.sidecar.core.wire import frame
@@ -48,9 +48,9 @@ def sizes(bench: Bench) -> list[int]:
     return [event.max_datagram for event in bench.events() if isinstance(event, PathMtuChanged)]
 
 
-def long_message() -> OutboundMessage:
+def long_message() -> MessageSymbols:
     content = message(size=3000).content
-    return OutboundMessage(2, PATH, content, deadline=10.0, expires=20.0, symbol=1472 - frame.FRAGMENT_OVERHEAD_BYTES)
+    return MessageSymbols(2, content, deadline=10.0, expires=20.0, symbol=1472 - frame.FRAGMENT_OVERHEAD_BYTES)
 
 
 def test_padded_probes_go_up_to_what_the_interface_takes() -> None:

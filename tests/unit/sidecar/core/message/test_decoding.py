@@ -11,9 +11,9 @@ import pytest
 from plr.protos.model.ids import NodeName, SessionId
 from plr.sidecar.core.message import decoding
 from plr.sidecar.core.message.decoding import MAX_BYTES, Decoding, DecodingLine
-from plr.sidecar.core.message.outbound import OutboundMessage
 from plr.sidecar.core.message.partial import SLICE_OPERATIONS, Partial
 from plr.sidecar.core.message.reassembly import Reassembler
+from plr.sidecar.core.message.symbols import MessageSymbols
 from plr.sidecar.core.seam.links import SendFinished, SendForgotten
 from plr.sidecar.core.seam.stats import EngineStats
 from plr.sidecar.core.transfer.inbound import Inbound
@@ -82,11 +82,11 @@ def test_slices_give_the_message(size: int) -> None:
     rng = random.Random(size)
     data = rng.randbytes(size)
     count = symbol_count(size, 1100)
-    message = OutboundMessage(1, path(), Encoded(b"", data), deadline=1.0, expires=2.0, symbol=1100, repairs=count)
+    message = MessageSymbols(1, Encoded(b"", data), deadline=1.0, expires=2.0, symbol=1100, repairs=count)
     lost = set(rng.sample(range(count), max(1, count // 3)))
     reassembler = Reassembler(A, Counter())
     content = None
-    for index in range(message.symbols):
+    for index in range(len(message)):
         if index not in lost and content is None:
             symbol = memoryview(message.symbol_data(index))
             found = reassembler.add([Fragment(1, size, message.symbol, index, symbol)], 0.0)

@@ -6,7 +6,6 @@ from collections import Counter
 
 import pytest
 
-from plr.sidecar.core.message.outbound import OutboundMessage
 from plr.sidecar.core.message.partial import Partial
 from plr.sidecar.core.message.reassembly import (
     MAX_AGE_S,
@@ -17,9 +16,10 @@ from plr.sidecar.core.message.reassembly import (
     Reassembled,
     Reassembler,
 )
+from plr.sidecar.core.message.symbols import MessageSymbols
 from plr.sidecar.core.wire.frame import MAX_MESSAGE_BYTES, Fragment, symbol_count
 from plr.sidecar.core.wire.messages import Encoded
-from tests.support.builders import A, path
+from tests.support.builders import A
 
 SYMBOL = 256
 
@@ -33,12 +33,10 @@ def symbols(number: int, data: bytes, symbol: int = SYMBOL) -> list[Fragment]:
 
 def coded(number: int, data: bytes, repairs: int, symbol: int = SYMBOL) -> list[Fragment]:
     """Source and repair symbols, as they come out of a sender."""
-    message = OutboundMessage(
-        number, path(), Encoded(b"", data), deadline=1.0, expires=2.0, symbol=symbol, repairs=repairs
-    )
+    message = MessageSymbols(number, Encoded(b"", data), deadline=1.0, expires=2.0, symbol=symbol, repairs=repairs)
     return [
         Fragment(number, len(data), message.symbol, index, memoryview(message.symbol_data(index)))
-        for index in range(message.symbols)
+        for index in range(len(message))
     ]
 
 

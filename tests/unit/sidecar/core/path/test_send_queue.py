@@ -8,10 +8,10 @@ from plr.sidecar.core.base.timers import NEVER
 from plr.sidecar.core.base.values import SHARE, Priority
 from plr.sidecar.core.path.send_queue import MAX_RUN, MAX_RUN_BYTES, PURGE_AT, SendQueue
 from plr.sidecar.core.wire.frame import FRAGMENT_OVERHEAD_BYTES
-from tests.support.builders import message, path
+from tests.support.builders import message
 
 if TYPE_CHECKING:
-    from plr.sidecar.core.message.outbound import OutboundMessage
+    from plr.sidecar.core.message.symbols import MessageSymbols
 
 ONE = 1
 """A budget for one symbol."""
@@ -252,13 +252,13 @@ def test_clearing_hands_back_what_did_not_leave_and_only_that() -> None:
 
 
 def left(queue: SendQueue) -> list[tuple[int, tuple[int, ...]]]:
-    cleared: list[tuple[OutboundMessage, tuple[int, ...]]] = queue.clear()
+    cleared: list[tuple[MessageSymbols, tuple[int, ...]]] = queue.clear()
     return [(outbound.number, indices) for outbound, indices in cleared]
 
 
-def covered(number: int, *, expected_at: float, size: int = 60_000, deadline: float = 4.0) -> OutboundMessage:
+def covered(number: int, *, expected_at: float, size: int = 60_000, deadline: float = 4.0) -> MessageSymbols:
     """A copy whose request another path answers at this time."""
-    sibling = message(100 + number, size, deadline=deadline, over=path("5g0"), siblings=[])
+    sibling = message(100 + number, size, deadline=deadline, siblings=[])
     sibling.expected_at = expected_at
     return message(number, size, deadline=deadline, siblings=sibling.siblings)
 
@@ -284,7 +284,7 @@ def test_what_another_path_does_not_answer_when_expected_takes_its_turn_again() 
 
 def test_nothing_is_expected_of_what_is_put_off_or_cleared() -> None:
     queue, first = SendQueue(), message(1, 60_000, deadline=4.0, siblings=[])
-    second = message(2, 60_000, deadline=4.0, over=path("5g0"), siblings=first.siblings)
+    second = message(2, 60_000, deadline=4.0, siblings=first.siblings)
     queue.add(first)
     assert take(queue, pace=PACE)[0] == 1
     assert first.expected_at < 4.0

@@ -6,20 +6,20 @@ import pytest
 
 from plr.sidecar.core.base.timers import NEVER
 from plr.sidecar.core.path.send_queue import PATIENCE, SMALL, Turn
-from tests.support.builders import message, path
+from tests.support.builders import message
 
 if TYPE_CHECKING:
-    from plr.sidecar.core.message.outbound import OutboundMessage
+    from plr.sidecar.core.message.symbols import MessageSymbols
 
 SIZE, PACE, ROUND_TRIP_S = 100_000, 200_000.0, 0.1
 """Half a second to send, 0.6 s to the answer."""
 
 
-def copies(*, deadline: float = 2.0) -> tuple[OutboundMessage, OutboundMessage]:
+def copies(*, deadline: float = 2.0) -> tuple[MessageSymbols, MessageSymbols]:
     """A request's copies over two paths."""
-    shared: list[OutboundMessage] = []
+    shared: list[MessageSymbols] = []
     one = message(1, SIZE, deadline=deadline, siblings=shared)
-    other = message(2, SIZE, deadline=deadline, over=path("5g0"), siblings=shared)
+    other = message(2, SIZE, deadline=deadline, siblings=shared)
     return one, other
 
 
@@ -98,7 +98,7 @@ def test_what_has_to_wait_is_not_expected_any_more() -> None:
 def test_what_was_cut_again_is_no_rival_of_what_it_became() -> None:
     one, other = copies()
     one.expected_at = 0.1
-    successor = one.cut_again(3, one.path, 1000)
+    successor = one.cut_again(3, 1000)
     assert covered_until(Turn(successor)) is None
     other.expected_at = 0.1
     assert covered_until(Turn(successor)) is not None

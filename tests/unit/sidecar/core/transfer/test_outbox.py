@@ -47,11 +47,11 @@ class Box:
             over, Encoded(b"", bytes(size)), priority=Priority.NORMAL, deadline=1.0, expires=expires
         )
         assert message is not None
-        assert self.commands.pop() == Send(over, message)
+        assert self.commands.pop() == Send(over, message.symbols)
         return message
 
     def lost(self, message: OutboundMessage, *indices: int, over: PathId = OVER_WLAN, timed_out: bool = False) -> None:
-        self.outbox.on_lost(FragmentsLost(over, message, indices, timed_out), 1.0)
+        self.outbox.on_lost(FragmentsLost(over, message.symbols, indices, timed_out), 1.0)
 
 
 def test_numbers_are_never_reused_and_finished_messages_go() -> None:
@@ -77,9 +77,9 @@ def test_a_peer_cannot_finish_the_messages_of_another() -> None:
 def test_lost_symbols_travel_again_but_not_those_that_arrived() -> None:
     box = Box(OVER_WLAN, OVER_WWAN)
     message = box.send()
-    message.acked[1] = 1
+    message.symbols.acked[1] = 1
     box.lost(message, 0, 1)
-    assert box.commands == [Resend(OVER_WLAN, message, (0,))]
+    assert box.commands == [Resend(OVER_WLAN, message.symbols, (0,))]
     box.lost(message, 1)
     assert len(box.commands) == 1
 
@@ -88,10 +88,10 @@ def test_after_a_timeout_the_other_path_is_taken_and_the_same_one_only_for_want_
     box = Box(OVER_WLAN, OVER_WWAN)
     message = box.send()
     box.lost(message, 0, timed_out=True)
-    assert box.commands.pop() == Resend(OVER_WWAN, message, (0,))
+    assert box.commands.pop() == Resend(OVER_WWAN, message.symbols, (0,))
     box.routes.set_state(OVER_WWAN, PathState.DOWN)
     box.lost(message, 0, timed_out=True)
-    assert box.commands.pop() == Resend(OVER_WLAN, message, (0,))
+    assert box.commands.pop() == Resend(OVER_WLAN, message.symbols, (0,))
 
 
 def lossy(box: Box, *paths: PathId) -> None:
@@ -105,13 +105,13 @@ def test_symbols_sent_again_over_a_lossy_path_travel_twice_and_again_only_when_b
     message = box.send()
     lossy(box, OVER_WLAN)
     box.lost(message, 0, 1)
-    twice = [Resend(OVER_WLAN, message, (0, 1))] * 2
+    twice = [Resend(OVER_WLAN, message.symbols, (0, 1))] * 2
     assert box.commands == twice
     box.lost(message, 0, 1)
     assert box.commands == twice
-    message.acked[1] = 1
+    message.symbols.acked[1] = 1
     box.lost(message, 0, 1)
-    assert box.commands[2:] == [Resend(OVER_WLAN, message, (0,))] * 2
+    assert box.commands[2:] == [Resend(OVER_WLAN, message.symbols, (0,))] * 2
 
 
 def test_the_copy_takes_another_path_when_it_is_as_good() -> None:
@@ -123,7 +123,7 @@ def test_the_copy_takes_another_path_when_it_is_as_good() -> None:
     assert message.interfaces == {WLAN, WWAN}
     box.routes.set_rtt(OVER_WWAN, 0.11)
     box.lost(message, 1)
-    assert box.commands[2:] == [Resend(OVER_WLAN, message, (1,))] * 2
+    assert box.commands[2:] == [Resend(OVER_WLAN, message.symbols, (1,))] * 2
 
 
 def test_the_last_symbol_travels_twice_over_a_lossy_path_unless_repair_symbols_cover_it() -> None:
@@ -134,7 +134,7 @@ def test_the_last_symbol_travels_twice_over_a_lossy_path_unless_repair_symbols_c
         content = Encoded(b"", bytes(5000))
         message = box.outbox.send(OVER_WLAN, content, priority=Priority.NORMAL, deadline=1.0, expires=9.0, fec=fec)
         assert message is not None
-        expected = [Send(OVER_WLAN, message), Resend(OVER_WLAN, message, (message.count - 1,))]
+        expected = [Send(OVER_WLAN, message.symbols), Resend(OVER_WLAN, message.symbols, (message.symbols.count - 1,))]
         assert box.commands == expected[: 1 + doubled]
 
 
@@ -143,7 +143,7 @@ def test_many_symbols_lost_at_once_travel_once() -> None:
     message = box.send(size=100_000)
     lossy(box, OVER_WLAN)
     box.lost(message, *range(MAX_COPIES + 1))
-    assert box.commands == [Resend(OVER_WLAN, message, tuple(range(MAX_COPIES + 1)))]
+    assert box.commands == [Resend(OVER_WLAN, message.symbols, tuple(range(MAX_COPIES + 1)))]
 
 
 def test_copies_do_not_hold_back_what_an_interface_took_with_it() -> None:
@@ -155,7 +155,7 @@ def test_copies_do_not_hold_back_what_an_interface_took_with_it() -> None:
     box.commands.clear()
     box.routes.set_state(OVER_WLAN, PathState.DOWN)
     box.do(box.outbox.on_interface_gone(WLAN), 1.0)
-    assert box.commands == [Resend(OVER_WWAN, message, (0, 1, 2))]
+    assert box.commands == [Resend(OVER_WWAN, message.symbols, (0, 1, 2))]
 
 
 def test_copies_do_not_hold_back_what_waited_for_a_path() -> None:
@@ -167,7 +167,7 @@ def test_copies_do_not_hold_back_what_waited_for_a_path() -> None:
     box.lost(message, 0, 1)
     box.commands.clear()
     box.come_up(OVER_WWAN)
-    assert box.commands == [Resend(OVER_WWAN, message, (0, 1, 2))]
+    assert box.commands == [Resend(OVER_WWAN, message.symbols, (0, 1, 2))]
 
 
 def test_without_a_path_messages_wait_and_all_missing_symbols_leave_with_the_first_one_up() -> None:
@@ -177,13 +177,13 @@ def test_without_a_path_messages_wait_and_all_missing_symbols_leave_with_the_fir
         box.lost(parked, 0)
         box.lost(parked, 2)
     assert not box.commands
-    message.acked[1] = 1
+    message.symbols.acked[1] = 1
     box.outbox.on_finished(A, delivered.number)
     box.outbox.drop(called_off)
     box.come_up(TO_B)
     assert not box.commands
     box.come_up(OVER_WWAN)
-    assert box.commands == [Resend(OVER_WWAN, message, (0, 2))]
+    assert box.commands == [Resend(OVER_WWAN, message.symbols, (0, 2))]
     box.come_up(OVER_WLAN)
     assert len(box.commands) == 1, "they wait no more"
 
@@ -247,8 +247,8 @@ def test_an_interface_that_goes_leaves_none_of_its_messages_behind() -> None:
     box.routes.forget_interface(WLAN)
     box.do(box.outbox.on_interface_gone(WLAN), 1.0)
     assert box.commands == [
-        Resend(OVER_WWAN, only_there, (0, 1, 2)),
-        Resend(OVER_WWAN, partly_there, (0, 1, 2)),
+        Resend(OVER_WWAN, only_there.symbols, (0, 1, 2)),
+        Resend(OVER_WWAN, partly_there.symbols, (0, 1, 2)),
     ]
     assert not elsewhere.over
 
@@ -257,10 +257,10 @@ def test_what_moved_to_another_interface_is_not_left_behind_there_either() -> No
     box = Box(OVER_WLAN, OVER_WWAN)
     message = box.send(OVER_WLAN)
     box.lost(message, 0, timed_out=True)
-    assert box.commands.pop() == Resend(OVER_WWAN, message, (0,))
+    assert box.commands.pop() == Resend(OVER_WWAN, message.symbols, (0,))
     box.routes.forget_interface(WWAN)
     box.do(box.outbox.on_interface_gone(WWAN), 1.0)
-    assert box.commands == [Resend(OVER_WLAN, message, (0, 1, 2))]
+    assert box.commands == [Resend(OVER_WLAN, message.symbols, (0, 1, 2))]
 
 
 def test_the_box_is_capped_and_a_greedy_peer_does_not_lock_others_out() -> None:
@@ -296,11 +296,11 @@ def test_symbols_fit_every_path_to_that_peer_that_is_not_down() -> None:
     carries(box, OVER_WLAN, 8952)
     carries(box, OVER_WWAN, 1372)
     box.routes.set_state(TO_B, PathState.UP)
-    assert box.send().datagram_bytes == 1372
-    assert box.send(TO_B).datagram_bytes == BASE_BYTES
+    assert box.send().symbols.datagram_bytes == 1372
+    assert box.send(TO_B).symbols.datagram_bytes == BASE_BYTES
     box.routes.set_state(OVER_WWAN, PathState.DOWN)
-    assert box.send(size=10_000).datagram_bytes == 8952
-    assert box.send(size=10).datagram_bytes < 100
+    assert box.send(size=10_000).symbols.datagram_bytes == 8952
+    assert box.send(size=10).symbols.datagram_bytes < 100
 
 
 def test_lost_symbols_take_the_path_that_carries_them() -> None:
@@ -311,25 +311,25 @@ def test_lost_symbols_take_the_path_that_carries_them() -> None:
     box.routes.set_rtt(OVER_WLAN, 1.0)
     box.lost(message, 0)
     box.lost(message, 1, timed_out=True)
-    assert box.commands == [Resend(OVER_WLAN, message, (0,)), Resend(OVER_WLAN, message, (1,))]
+    assert box.commands == [Resend(OVER_WLAN, message.symbols, (0,)), Resend(OVER_WLAN, message.symbols, (1,))]
 
 
 def test_a_message_that_no_path_carries_any_more_is_cut_again() -> None:
     box = Box(OVER_WLAN)
     carries(box, OVER_WLAN, 1472)
     message = box.send(size=3000)
-    message.acked[0] = 1
+    message.symbols.acked[0] = 1
     box.routes.set_state(OVER_WWAN, PathState.UP)
     box.routes.set_state(OVER_WLAN, PathState.DOWN)
     box.lost(message, 1)
     (command,) = box.commands
     recut = message.newest
-    assert command == Send(OVER_WWAN, recut)
+    assert command == Send(OVER_WWAN, recut.symbols)
     assert message.over
     assert recut.number > message.number
-    assert recut.datagram_bytes == BASE_BYTES
-    assert len(recut.missing()) == recut.count
-    assert b"".join(recut.symbol_data(index) for index in range(recut.count)) == bytes(3000)
+    assert recut.symbols.datagram_bytes == BASE_BYTES
+    assert len(recut.symbols.missing()) == recut.symbols.count
+    assert b"".join(recut.symbols.symbol_data(index) for index in range(recut.symbols.count)) == bytes(3000)
     assert (len(box.outbox), box.outbox.held_bytes) == (1, 3000)
     # Who still holds the first one means the bytes.
     box.lost(message, 2)
@@ -348,8 +348,8 @@ def test_what_waits_for_a_path_is_cut_to_the_one_that_comes() -> None:
     assert not box.commands
     box.routes.set_state(OVER_WLAN, PathState.UP)
     box.come_up(OVER_WLAN)
-    assert box.commands == [Send(OVER_WLAN, message.newest)]
-    assert message.newest.datagram_bytes == BASE_BYTES
+    assert box.commands == [Send(OVER_WLAN, message.newest.symbols)]
+    assert message.newest.symbols.datagram_bytes == BASE_BYTES
 
 
 def test_a_suspect_path_is_left_for_one_that_is_too_small() -> None:
@@ -360,13 +360,13 @@ def test_a_suspect_path_is_left_for_one_that_is_too_small() -> None:
     box.routes.set_state(OVER_WWAN, PathState.UP)
     box.routes.set_state(OVER_WLAN, PathState.UNSTABLE)
     box.lost(message, 0, timed_out=True)
-    assert box.commands == [Send(OVER_WWAN, message.newest)]
+    assert box.commands == [Send(OVER_WWAN, message.newest.symbols)]
 
 
 def test_a_peer_that_has_part_of_a_dropped_message_is_told() -> None:
     box = Box(OVER_WLAN)
     message = box.send(size=3000)
-    message.symbol_data(0)
+    message.symbols.symbol_data(0)
     box.outbox.drop(message)
     box.outbox.drop(message)
     assert box.commands == [SendAbandon(OVER_WLAN, message.number)]
@@ -376,7 +376,7 @@ def test_nothing_is_said_of_messages_that_did_not_leave_or_that_one_datagram_hol
     box = Box(OVER_WLAN)
     unsent, small, finished, answered = (box.send(size=size) for size in (3000, 100, 3000, 3000))
     for begun in (small, finished, answered):
-        begun.symbol_data(0)
+        begun.symbols.symbol_data(0)
     box.outbox.drop(unsent)
     box.outbox.drop(small)
     box.outbox.on_finished(A, finished.number)
@@ -388,14 +388,14 @@ def test_nothing_is_said_of_messages_that_did_not_leave_or_that_one_datagram_hol
 def test_a_forgotten_message_is_sent_again_but_not_for_ever() -> None:
     box = Box(OVER_WLAN)
     first = message = box.send(size=3000)
-    message.acked[0] = message.acked[1] = 1
+    message.symbols.acked[0] = message.symbols.acked[1] = 1
     for _ in range(MAX_GENERATIONS):
         box.outbox.on_forgotten(B, message.number)  # not his
         box.outbox.on_forgotten(A, message.number)
         assert message.over
         message = first.newest
-        assert box.commands.pop() == Send(OVER_WLAN, message)
-        assert len(message.missing()) == message.count
+        assert box.commands.pop() == Send(OVER_WLAN, message.symbols)
+        assert len(message.symbols.missing()) == message.symbols.count
         assert (len(box.outbox), box.outbox.held_bytes) == (1, 3000)
     box.outbox.on_forgotten(A, message.number)
     assert (len(box.outbox), box.outbox.held_bytes, box.commands) == (0, 0, [])

@@ -32,10 +32,10 @@ def known(target: float = 0.001, budgets: tuple[Budget, ...] = ()) -> Table:
 
 def looked_at(table: Table, until: float, *, arrives: float = 0.0) -> float | None:
     """When the request, sent at 0, got its second copy; `arrives`: share of its symbols for each second."""
-    (message,) = [message for message in table.outbox._messages.values() if message.path == WLAN_A]
+    (symbols,) = [message.symbols for message in table.outbox._messages.values() if message.path == WLAN_A]
     while (timer := table.table.next_timer()) is not None and timer < until:
-        arrived = min(message.symbols, int(arrives * timer * message.symbols))
-        message.acked[:arrived] = b"\1" * arrived
+        arrived = min(len(symbols), int(arrives * timer * len(symbols)))
+        symbols.acked[:arrived] = b"\1" * arrived
         table.table.handle_timer(timer)
         if table.sent():
             return timer

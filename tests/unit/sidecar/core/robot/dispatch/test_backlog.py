@@ -112,7 +112,7 @@ def test_a_small_request_does_not_wait_for_a_large_one_nor_take_its_turn() -> No
     assert table.sent() == []
     table.respond(number=1)
     table.use_room(0.2)
-    waited = [len(message.content.payload) for message in table.outbox._messages.values()][-2:]
+    waited = [len(message.symbols.content.payload) for message in table.outbox._messages.values()][-2:]
     assert waited == [16_000_000, 300_000]
 
 
@@ -147,7 +147,7 @@ def test_what_left_may_have_run_and_what_did_not_has_not(begun: bool) -> None:
     (message,) = table.outbox._messages.values()
     assert table.sent() == [WLAN_A]
     if begun:
-        message.symbol_data(0)
+        message.symbols.symbol_data(0)
         # Cut again, with nothing of the second message under way.
         table.outbox.on_forgotten(A, message.number)
     table.outbox.drop_peer(A)

@@ -139,8 +139,8 @@ def siblings(table: Table, number: int = 1) -> list[PathId]:
     """Over which paths those copies travel that may leave the request to each other."""
     request = table.table._requests.get(request_id(number))
     assert request is not None
-    copy = request.copies[-1]
-    return [message.path for message in copy.message.siblings]
+    shared = request.copies[-1].message.symbols.siblings
+    return [copy.path for copy in request.copies if copy.message.symbols in shared]
 
 
 def test_copies_of_a_request_may_leave_it_to_each_other_except_in_a_full_race() -> None:
