@@ -136,11 +136,11 @@ def assert_bounded(node: Node) -> None:
     assert len(engine._inbound._reassemblers) <= len(engine.peers.names())
     assert len(engine._outbox) <= MAX_MESSAGES
     assert engine._outbox.held_bytes <= MAX_PEER_BYTES * len(engine.peers.names())
-    answers = engine._serving.answers
+    answers = engine.cloud.answers
     assert len(answers) <= MAX_ANSWERS
     assert answers.held_bytes <= MAX_ANSWER_BYTES
     assert len(answers._timers) <= 2 * len(answers) + ANSWER_TIMER_SLACK + 1
-    executions = engine._serving.executions
+    executions = engine.cloud.executions
     assert executions.running <= MAX_RUNNING
     assert len(executions._finished) <= MAX_REMEMBERED + MAX_RUNNING
     assert len(executions._timers) <= 2 * executions.running + TIMER_SLACK + 1
@@ -214,7 +214,7 @@ def test_a_robot_that_never_acknowledges_does_not_fill_the_outbox_for_the_others
         mesh.run(0.002)
     mesh.run(0.02)
     assert_bounded(cloud)
-    assert len(cloud.engine._outbox) > 1000 or cloud.engine._serving.executions.running > 1000
+    assert len(cloud.engine._outbox) > 1000 or cloud.engine.cloud.executions.running > 1000
     honest.submit(b"still here")
     mesh.run(0.1)
     assert len(honest.responses()) == 1

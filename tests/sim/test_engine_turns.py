@@ -88,7 +88,7 @@ class World:
         cloud = self.mesh.cloud(f"cloud-{number}")
         cloud.server_delay = lambda: None
         cloud.offers = tuple(ServiceOffer(name, TYPE) for name in self.names)
-        cloud.engine.set_offers(cloud.offers)
+        cloud.engine.cloud.set_offers(cloud.offers)
         return cloud
 
     def set_carrier(self, *interfaces: str, on: bool) -> None:
@@ -101,7 +101,7 @@ class World:
         for cloud in self.clouds:
             cloud.alive = False
             cloud.start()
-            cloud.engine.set_offers(cloud.offers)
+            cloud.engine.cloud.set_offers(cloud.offers)
         self._push_views()
         self.mesh.run(0.5)
 

@@ -228,6 +228,7 @@ class ExecutionTable:
         self._running_bytes.take(path.peer, size)
         self._by_request[key] = execution
         self._running[execution.id] = execution
+        self._stats.in_flight = len(self._running)
         self._arm(execution)
         count[message.service, "run"] += 1
         return ExecuteRequest(
@@ -370,6 +371,7 @@ class ExecutionTable:
         if execution is None:
             self._stats.dropped["answer_to_unknown_execution"] += 1
             return None
+        self._stats.in_flight = len(self._running)
         del self._by_request[execution.key]
         self._running_shares.give_back(execution.robot)
         self._running_bytes.give_back(execution.robot, execution.size)

@@ -75,6 +75,13 @@ class Outbox:
         """Return whether another message of this size may be sent to this peer."""
         return self._room.fits(peer, size)
 
+    def admits(self, peer: NodeName, size: int) -> bool:
+        """Return whether another message of this size may be sent to this peer; count it as left out if not."""
+        fits = self._room.fits(peer, size)
+        if not fits:
+            self._stats.dropped["outbox_full"] += 1
+        return fits
+
     def take_made_room(self) -> bool:
         """Return whether a message ended since the last call, so that what waits for room may find it."""
         made, self._made_room = self._made_room, False
@@ -105,17 +112,14 @@ class Outbox:
         answers: RequestId | None = None,
         copy_of: RequestId | None = None,
         siblings: list[OutboundMessage] | None = None,
-    ) -> OutboundMessage | None:
-        """Send a message over `path`; return None (counted) if there is no room.
+    ) -> OutboundMessage:
+        """Send a message over `path`, to a peer that has room for it: `has_room` and `admits` say which.
 
         `fec`: repair symbols for each source symbol, None: by the path's loss; none at all if they find no room.
         `answers`: the request that it answers, by which `drop_answers` finds it.
         `copy_of`: the request that it is a copy of.
         `siblings`: the messages that already carry the same request; it joins them.
         """
-        if not self.has_room(path.peer, content.size):
-            self._stats.dropped["outbox_full"] += 1
-            return None
         symbol = self._routes.symbol_to(path.peer)
         count = symbol_count(content.size, symbol)
         repairs = repair_symbols(count, fec, self._routes.loss(path))
