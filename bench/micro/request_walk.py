@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from types import FrameType
 
     from bench.core_speed import Side
+    from plr.sidecar.core.base.values import ExecutionId
     from plr.sidecar.core.link.sender import Batch
     from plr.sidecar.core.seam.application import ApplicationEvent
     from plr.sidecar.core.seam.links import LinkEvent
@@ -93,7 +94,7 @@ class _Walk:
 
     def legs(self, request: RequestId) -> Iterator[Leg]:
         robot, cloud = self._robot, self._cloud
-        leg, _ = _noted("robot engine: submit", robot.engine.submit, request, SERVICE, PAYLOAD, self._now)
+        leg, _ = _noted("robot engine: submit", self._submit, request)
         yield leg
         leg, batches = _noted("robot link: seal", self._send, robot)
         yield leg
@@ -103,7 +104,7 @@ class _Walk:
         leg, events = _noted("cloud engine: run once", self._tell, cloud, news)
         yield leg
         execution = next(event.execution for event in events if isinstance(event, ExecuteRequest))
-        leg, _ = _noted("cloud engine: complete", cloud.engine.complete, execution, ANSWER, 0.0, self._now)
+        leg, _ = _noted("cloud engine: complete", self._complete, execution)
         yield leg
         leg, batches = _noted("cloud link: seal", self._send, cloud)
         yield leg
@@ -112,6 +113,12 @@ class _Walk:
         yield leg
         leg, _ = _noted("robot engine: answer wins", self._deliver, news)
         yield leg
+
+    def _submit(self, request: RequestId) -> None:
+        self._robot.engine.robot.requests.submit(request, SERVICE, PAYLOAD, self._now)
+
+    def _complete(self, execution: ExecutionId) -> None:
+        self._cloud.engine.cloud.complete(execution, ANSWER, 0.0, self._now)
 
     def _send(self, side: Side) -> list[Batch]:
         for _, command in side.engine.take_commands():
@@ -137,7 +144,7 @@ class _Walk:
     def _deliver(self, news: list[LinkEvent]) -> None:
         for event in self._tell(self._robot, news):
             if isinstance(event, ResponseArrived):
-                self._robot.engine.judge_answer(event.request_id, event.copy, None, self._now)
+                self._robot.engine.robot.requests.judge_answer(event.request_id, event.copy, None, self._now)
 
 
 def _noted(name: str, act: Callable[P, R], *args: P.args, **kwargs: P.kwargs) -> tuple[Leg, R]:
