@@ -34,6 +34,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator
 
     from plr.protos.model.ids import InterfaceName
+    from plr.sidecar.core.cloud.cloud_role import CloudRole
     from plr.sidecar.core.path.path import Path
 
 
@@ -136,18 +137,23 @@ def assert_bounded(node: Node) -> None:
     assert len(engine._inbound._reassemblers) <= len(engine.peers.names())
     assert len(engine._outbox) <= MAX_MESSAGES
     assert engine._outbox.held_bytes <= MAX_PEER_BYTES * len(engine.peers.names())
-    answers = engine.cloud.answers
+    assert len(engine.stats.executions) < 20
+    assert len(engine.stats.dropped) < 40
+    if node.role is Role.CLOUD:
+        assert_cloud_bounded(engine.cloud)
+
+
+def assert_cloud_bounded(cloud: CloudRole) -> None:
+    answers = cloud.answers
     assert len(answers) <= MAX_ANSWERS
     assert answers.held_bytes <= MAX_ANSWER_BYTES
     assert len(answers._timers) <= 2 * len(answers) + ANSWER_TIMER_SLACK + 1
-    executions = engine.cloud.executions
+    executions = cloud.executions
     assert executions.running <= MAX_RUNNING
     assert len(executions._finished) <= MAX_REMEMBERED + MAX_RUNNING
     assert len(executions._timers) <= 2 * executions.running + TIMER_SLACK + 1
     assert executions._cache.held_bytes <= MAX_CACHED_BYTES
     assert len(executions._refused) <= MAX_REFUSED_COPIES
-    assert len(engine.stats.executions) < 20
-    assert len(engine.stats.dropped) < 40
     for link in node.links.values():
         assert len(link.stats.dropped) < 20
         for path in link._paths.values():

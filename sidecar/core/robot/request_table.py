@@ -96,8 +96,7 @@ class RequestTable:
         self._held_bytes += request.held
         self._arm(request.deadline_at, request_id)
         request.dark = self._parts.routes.dark(servers)
-        self._dispatch(request, servers, now)
-        if request in self._no_room:
+        if self._start(request, self._no_room.open_to(request, servers), now):
             self.on_room(now)  # it may be more urgent than those that wait, or small enough
         self._notice_unreachable(request, now)
 
@@ -134,14 +133,10 @@ class RequestTable:
             if now >= request.deadline_at:
                 self._end_answered_here(request, now)
 
-    def _dispatch(self, request: Request, servers: tuple[NodeName, ...], now: float) -> None:
-        """Send a request without copies to some of these servers, unless others wait for the same room."""
-        if request not in self._no_room:
-            self._start(request, self._no_room.open_to(request, servers), now)
-
-    def _start(self, request: Request, servers: list[NodeName], now: float) -> None:
+    def _start(self, request: Request, servers: list[NodeName], now: float) -> bool:
+        """Send a request without copies to some of these servers; return whether it waits for room now."""
         self._look_at(request, self._dispatching.start(request, servers, now))
-        self._no_room.consider(request)
+        return not request.copies and self._no_room.consider(request)
 
     def on_room(self, now: float) -> None:
         """Send the requests that found no room, each in its turn, since less waits to be sent than before."""
@@ -242,7 +237,11 @@ class RequestTable:
         )
 
     def _call_off_losers(self, request: Request, winner: Copy, answer: Answer, now: float) -> None:
-        losers = [copy for copy in request.pending() if copy.hedges or not request.observed]
+        losers = (
+            [copy for copy in request.pending() if copy.hedges or not request.observed]
+            if len(request.copies) > 1
+            else []
+        )
         if losers:
             small = answer.size <= SMALL_ANSWER_BYTES
             self._calling_off.call_off(request, losers, now, untold=winner.path.peer if small else None)
@@ -271,7 +270,10 @@ class RequestTable:
         """Finish a request that was answered at this time."""
         elapsed = at - request.submitted_at
         self._finish(request, "deadline_missed" if elapsed > request.rule.deadline_s else "ok")
-        self._parts.stats.durations.setdefault(request.service, Histogram()).record(elapsed)
+        durations = self._parts.stats.durations.get(request.service)
+        if durations is None:
+            durations = self._parts.stats.durations[request.service] = Histogram()
+        durations.record(elapsed)
 
     def _answer_is_bad(self, request: Request, copy: Copy, problem: str, now: float) -> None:
         """Fail the copy as if its server had not answered, and ask others, which replace that server for a while."""
@@ -445,8 +447,8 @@ class RequestTable:
         """Send a request that had no path, or whose copies are all in trouble, as there is one more way to a server."""
         if request.copies:
             self._rescue(request, now)
-        else:
-            self._dispatch(request, self._dispatching.candidates(request), now)
+        elif request not in self._no_room:
+            self._start(request, self._no_room.open_to(request, self._dispatching.candidates(request)), now)
 
     def _notice_unreachable(self, request: Request, _now: float) -> None:
         if request.rule.fallback is None or request.found_unreachable or request.done:

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from plr.protos.model.ids import InterfaceName, NodeName
     from plr.sidecar.core.base.slices import Step
     from plr.sidecar.core.base.values import PathId, Priority, RequestId
-    from plr.sidecar.core.message.repair import Redundancy
+    from plr.sidecar.core.message.repair import Loss, Redundancy
     from plr.sidecar.core.seam.links import PathCommand
     from plr.sidecar.core.seam.stats import EngineStats
     from plr.sidecar.core.transfer.routes import Routes
@@ -120,10 +120,11 @@ class Outbox:
         `copy_of`: the request that it is a copy of.
         `siblings`: the messages that already carry the same request; it joins them.
         """
+        size, loss = content.size, self._routes.loss(path)
         symbol = self._routes.symbol_to(path.peer)
-        count = symbol_count(content.size, symbol)
-        repairs = repair_symbols(count, fec, self._routes.loss(path))
-        if repairs and not self._room.fits(path.peer, content.size, (count + repairs) * symbol):
+        count = symbol_count(size, symbol)
+        repairs = repair_symbols(count, fec, loss)
+        if repairs and not self._room.fits(path.peer, size, (count + repairs) * symbol):
             repairs = 0
         message = OutboundMessage(
             self._take_number(),
@@ -138,7 +139,7 @@ class Outbox:
             copy_of=copy_of,
             siblings=siblings,
         )
-        self._enter(message)
+        self._enter(message, loss)
         return message
 
     def _take_number(self) -> int:
@@ -146,21 +147,22 @@ class Outbox:
         self._next_number += 1
         return number
 
-    def _enter(self, message: OutboundMessage) -> None:
-        self._messages[message.number] = message
-        self._by_peer.setdefault(message.peer, {})[message.number] = message
+    def _enter(self, message: OutboundMessage, loss: Loss) -> None:
+        peer, number = message.path.peer, message.number
+        self._messages[number] = message
+        self._by_peer.setdefault(peer, {})[number] = message
         if message.answers is not None:
-            self._answers.setdefault((message.peer, message.answers), []).append(message)
+            self._answers.setdefault((peer, message.answers), []).append(message)
         self._room.take(message)
         self._command(Send(message.path, message))
-        if not message.repairs and worth_a_copy(1, self._routes.loss(message.path)):
+        if not message.repairs and worth_a_copy(1, loss):
             # It leaves before the others, so a burst does not take both.
             self._send_copies(message, message.path, (message.count - 1,))
 
     def on_finished(self, peer: NodeName, number: int) -> OutboundMessage | None:
         """Remove a message that the peer holds; None if it is not one of the peer's messages, or was already over."""
         message = self._messages.get(number)
-        if message is None or message.peer != peer:
+        if message is None or message.path.peer != peer:
             return None
         self._remove(message)
         return message
@@ -192,15 +194,16 @@ class Outbox:
     def _remove(self, message: OutboundMessage) -> None:
         message.over = True
         if self._messages.pop(message.number, None) is not None:
-            of_peer = self._by_peer.get(message.peer, {})
+            peer = message.path.peer
+            of_peer = self._by_peer.get(peer, {})
             of_peer.pop(message.number, None)
             if not of_peer:
-                self._by_peer.pop(message.peer, None)
+                self._by_peer.pop(peer, None)
             self._room.give_back(message)
             self._made_room = True
-            self._parked.get(message.peer, {}).pop(message.number, None)
+            self._parked.get(peer, {}).pop(message.number, None)
             if message.answers is not None:
-                self._forget_answer((message.peer, message.answers), message)
+                self._forget_answer((peer, message.answers), message)
 
     def drop_answers(self, peer: NodeName, request: RequestId) -> None:
         """Keep back what is unsent of the answers to this request, which the peer called off."""
@@ -261,7 +264,8 @@ class Outbox:
         self._enter_again(message, path)
 
     def _enter_again(self, message: OutboundMessage, path: PathId) -> None:
-        self._enter(message.cut_again(self._take_number(), path, self._routes.symbol_to(path.peer)))
+        again = message.cut_again(self._take_number(), path, self._routes.symbol_to(path.peer))
+        self._enter(again, self._routes.loss(path))
 
     def on_path_up(self, path: PathId) -> list[Step]:
         """Return the steps that send all that waited for a path to this peer."""

@@ -78,13 +78,13 @@ class Dispatching:
         servers = self._favoured(servers, now)
         chosen = self._parts.mapping.choose(request.service, servers, idempotent=rule.idempotent)
         if MODES[rule.redundancy].at_once:
-            self._send_all(request, self._best_first(request, chosen, now) if self._budgets else chosen, now)
+            self._send_all(request, self._best_first(request, chosen, now) if self._budgets.limit else chosen, now)
         else:
             self._send_best(request, self._best_first(request, chosen, now), now)
         if servers and not request.copies:
             self._parts.to_all_links(Seek(frozenset(servers)))
         look_at = self.first_look(request, now)
-        unmapped = self._exploration.path(request, servers, now)
+        unmapped = self._exploration.path(request, servers, now) if rule.exploration else None
         if unmapped is not None and self._parts.outbox.admits(unmapped.peer, request.size):
             self._send(request, unmapped, now, _Why.EXPLORATION)
         request.choose_observation()
@@ -125,7 +125,7 @@ class Dispatching:
 
     def first_look(self, request: Request, now: float) -> float | None:
         """Return when to call `look_again` for a request of which one copy was just sent, if at all."""
-        if not request.relied_on() or now >= request.deadline_at or not request.rule.redundancy.helps:
+        if now >= request.deadline_at or not request.relied_on():
             return None
         return MODES[request.rule.redundancy].first_look(self, request, now)
 
@@ -239,13 +239,14 @@ class Dispatching:
     def ended(self, request: Request, now: float) -> None:
         """Note the outcome of the copies, once for each request: all are known, or the deadline is over."""
         self.records.note(request, now)
-        if self._budgets and any(copy.in_time for copy in request.copies):
+        if self._budgets.limit and any(copy.in_time for copy in request.copies):
             paths = (*request.withheld, *(copy.path for copy in request.copies))
             self._budgets.earn(request.copies[0].message.total, {path.interface for path in paths})
 
     def _send(self, request: Request, path: PathId, now: float, why: _Why) -> bool:
         """Send a copy for which the path's server has room; return whether the budgets and MAX_COPIES allowed it."""
-        if request.payload is None or len(request.copies) >= _most_copies(request):
+        sent = len(request.copies)
+        if request.payload is None or (sent >= MAX_COPIES and sent >= _most_copies(request)):
             return False
         rule, stats = request.rule, self._parts.stats
         extra = bool(request.copies and request.relied_on())
@@ -272,7 +273,7 @@ class Dispatching:
             deadline=deadline,
             expires=expires,
             copy_of=request.id,
-            siblings=request.messages if why in _PLANNED and not request.is_race() else None,
+            siblings=request.messages if why in _PLANNED and not request.races else None,
         )
         explores = why is _Why.EXPLORATION
         copy = Copy(path, now, message, explores=explores, hedges=why is _Why.HEDGE)

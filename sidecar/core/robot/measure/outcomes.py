@@ -45,7 +45,7 @@ def interface_outcomes(request: Request) -> Iterator[tuple[InterfacePair, PairOu
         for interface in request.dark:
             if interface not in missed:
                 missed[interface] = not any(copy.in_time for copy in request.copies if copy.path.interface == interface)
-    raced = request.is_race()
+    raced = request.races
     to_one = len(servers) > 1 and len(set(servers.values())) == 1
     if not raced and (len(missed) != 2 or to_one):
         return
