@@ -141,6 +141,12 @@ def assert_bounded(node: Node) -> None:
     assert len(engine.stats.dropped) < 40
     if node.role is Role.CLOUD:
         assert_cloud_bounded(engine.cloud)
+    for link in node.links.values():
+        assert len(link.stats.dropped) < 20
+        for path in link._paths.values():
+            assert len(path.pending) <= MAX_PENDING_FRAMES
+            assert len(path.finished) <= MAX_PENDING_FINISHED
+            assert path.recovery.in_flight >= 0
 
 
 def assert_cloud_bounded(cloud: CloudRole) -> None:
@@ -154,12 +160,6 @@ def assert_cloud_bounded(cloud: CloudRole) -> None:
     assert len(executions._timers) <= 2 * executions.running + TIMER_SLACK + 1
     assert executions._cache.held_bytes <= MAX_CACHED_BYTES
     assert len(executions._refused) <= MAX_REFUSED_COPIES
-    for link in node.links.values():
-        assert len(link.stats.dropped) < 20
-        for path in link._paths.values():
-            assert len(path.pending) <= MAX_PENDING_FRAMES
-            assert len(path.finished) <= MAX_PENDING_FINISHED
-            assert path.recovery.in_flight >= 0
 
 
 def arena(seed: int) -> tuple[Mesh, Node, Node, Node]:
