@@ -562,8 +562,7 @@ class RequestTable:
                     self._parts.measurements.called_off(request.carried(copy), now - copy.sent_at)
             self._calling_off.call_off(request, undelivered, now)
         if request.done and not request.pending():
-            if request.id in self._requests:
-                self._requests.remove(request)
+            if self._requests.remove(request):
                 self._held_bytes -= request.held
             request.messages.clear()
             self._measure(request, now)
