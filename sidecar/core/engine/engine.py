@@ -1,7 +1,7 @@
-"""Holds the sidecar's requests, peers and routes, which all links share. Sans-IO; the caller serialises the calls.
+"""Holds a sidecar's role, peers, routes and messages, which all links share. Sans-IO; the caller serialises the calls.
 
 Inputs are method calls with `now`; outputs are `take_commands` (for the links) and `take_events` (for the
-application). Nothing here builds, seals or parses a datagram.
+application). Nothing here builds, seals or parses a datagram. What a robot and a cloud do differently is in their roles.
 """
 
 from __future__ import annotations
