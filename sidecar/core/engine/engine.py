@@ -1,7 +1,7 @@
 """Holds a sidecar's role, peers, routes and messages, which all links share. Sans-IO; the caller serialises the calls.
 
 Inputs are method calls with `now`; outputs are `take_commands` (for the links) and `take_events` (for the
-application). Nothing here builds, seals or parses a datagram. What a robot and a cloud do differently is in their roles.
+application). Nothing here builds, seals or parses a datagram. What only one of the roles does is in its object.
 """
 
 from __future__ import annotations
@@ -83,14 +83,14 @@ class Engine:
     def __init__(self, config: EngineConfig, own: OwnSession, now: float) -> None:
         self._backlog = Backlog()
         self.stats = EngineStats()
-        self._commands: list[tuple[InterfaceName | None, LinkCommand]] = []
+        self._commands: list[LinkCommand] = []
         self._events: list[ApplicationEvent] = []
         self._interfaces: set[InterfaceName] = set()
         self._sweep_at = now + SWEEP_EVERY_S
-        self._inbound = Inbound(self._to_link, self.stats, answers=config.role is Role.CLOUD)
+        self._inbound = Inbound(self._commands.append, self.stats, answers=config.role is Role.CLOUD)
         self.peers = Peers(own, self.stats.dropped)
         self.routes = Routes()
-        self._outbox = Outbox(self.routes, self._to_link, self.stats)
+        self._outbox = Outbox(self.routes, self._commands.append, self.stats)
         self.revocations = RevocationExchange(self.routes, self._outbox, self.stats)
         parts = EngineParts(
             Rules(config.rules),
@@ -99,7 +99,7 @@ class Engine:
             self._outbox,
             self.stats,
             self._events.append,
-            self._to_all_links,
+            self._commands.append,
             self._backlog,
         )
         self._role: EngineRole = RobotRole(parts, config.budgets) if config.role is Role.ROBOT else CloudRole(parts)
@@ -122,8 +122,9 @@ class Engine:
 
     def take_commands(self) -> list[tuple[InterfaceName | None, LinkCommand]]:
         """Return the commands for the links; None as interface means all of them."""
-        commands, self._commands = self._commands, []
-        return commands
+        commands = self._commands[:]
+        self._commands.clear()
+        return [(command.path.interface if isinstance(command, PathCommand) else None, command) for command in commands]
 
     def take_events(self) -> list[ApplicationEvent]:
         """Return the events for the application."""
@@ -140,14 +141,8 @@ class Engine:
         """Return the number of messages to decode."""
         return self._inbound.decodings
 
-    def _to_link(self, command: PathCommand) -> None:
-        self._commands.append((command.path.interface, command))
-
-    def _to_all_links(self, command: LinkCommand) -> None:
-        self._commands.append((None, command))
-
     def _tell_links_of_peers(self) -> None:
-        self._to_all_links(SetPeers(self.peers.for_links()))
+        self._commands.append(SetPeers(self.peers.for_links()))
 
     # -- the program ----------------------------------------------------------------------------------------------
 

@@ -69,7 +69,7 @@ class RequestTable:
         self._backlog = parts.backlog
         self._timers: list[tuple[float, RequestId]] = []
         self._most_timers = TIMER_SLACK
-        self._attention = Attention(parts.to_all_links)
+        self._attention = Attention(parts.command)
         self._calling_off = CallingOff(parts.routes, parts.outbox, parts.stats)
         self._dispatching = Dispatching(parts)
         self._no_room = NoRoom(self._dispatching, parts.routes)

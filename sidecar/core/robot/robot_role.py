@@ -58,7 +58,7 @@ class RobotRole:
                 self._measurements,
                 parts.stats,
                 parts.emit,
-                parts.to_all_links,
+                parts.command,
                 budgets,
                 parts.backlog,
                 penalties=self._penalties,
@@ -211,7 +211,7 @@ class RobotRole:
         if state is PathState.UP:
             self._goodbyes.is_back(path.peer)
             if self.requests.unanswered:  # the other paths may be back as well, and share what waits
-                self._parts.to_all_links(Seek(frozenset((path.peer,))))
+                self._parts.command(Seek(frozenset((path.peer,))))
         self.requests.on_path_changed(path, state, now)
 
     def on_path_gone(self, path: PathId, now: float) -> None:

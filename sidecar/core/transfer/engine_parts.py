@@ -48,5 +48,6 @@ class EngineParts:
     outbox: Outbox
     stats: EngineStats
     emit: Callable[[ApplicationEvent], None]
-    to_all_links: Callable[[LinkCommand], None]
+    command: Callable[[LinkCommand], None]
+    """Takes a command for the link of the path that it names, or for all links if it names none."""
     backlog: Backlog

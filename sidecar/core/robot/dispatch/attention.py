@@ -20,10 +20,10 @@ ATTEND_EVERY_S = 0.5
 class Attention:
     """The servers that links were told about less than ATTEND_EVERY_S ago."""
 
-    __slots__ = ("_to_all_links", "_told", "_until")
+    __slots__ = ("_command", "_told", "_until")
 
-    def __init__(self, to_all_links: Callable[[LinkCommand], None]) -> None:
-        self._to_all_links = to_all_links
+    def __init__(self, command: Callable[[LinkCommand], None]) -> None:
+        self._command = command
         self._told: frozenset[NodeName] = frozenset()
         self._until = -math.inf
 
@@ -35,4 +35,4 @@ class Attention:
         if not self._told.issuperset(servers):
             wanted = frozenset(servers)
             self._told |= wanted
-            self._to_all_links(Attend(wanted))
+            self._command(Attend(wanted))

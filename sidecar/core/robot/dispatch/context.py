@@ -34,7 +34,7 @@ class RequestParts:
     measurements: Measurements
     stats: EngineStats
     emit: Callable[[ApplicationEvent], None]
-    to_all_links: Callable[[LinkCommand], None]
+    command: Callable[[LinkCommand], None]
     budgets: tuple[Budget, ...] = ()
     """Limits on the cost of extra copies."""
     backlog: Backlog = field(default_factory=Backlog)

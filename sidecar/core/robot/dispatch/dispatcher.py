@@ -82,7 +82,7 @@ class Dispatching:
         else:
             self._send_best(request, self._best_first(request, chosen, now), now)
         if servers and not request.copies:
-            self._parts.to_all_links(Seek(frozenset(servers)))
+            self._parts.command(Seek(frozenset(servers)))
         look_at = self.first_look(request, now)
         unmapped = self._exploration.path(request, servers, now) if rule.exploration else None
         if unmapped is not None and self._parts.outbox.admits(unmapped.peer, request.size):
