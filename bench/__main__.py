@@ -7,6 +7,7 @@ examples:
   make bench-insiders BENCH_ARGS='--minutes 2'               a robot and a cloud of the fleet attack the others
   make bench-control BENCH_ARGS='--size 500'                 a fleet's control streams at one control plane
   python -m bench alerts                                     what a real Alertmanager says when one server of five dies
+  python -m bench micro                                      counts what one request passes through: calls, files
   make bench-fleet-day BENCH_ARGS='--members 100 --hours 6'  shows whether anything drifts or grows in a day
   make bench-quick                                           15 s of a drive with every contender
   python -m bench evaluate --scenario 'drive-*' --contender plr-replicate
@@ -31,6 +32,7 @@ from bench.evaluation import scenarios_command as scenarios
 from bench.fleetday import command as fleet_day
 from bench.insiders import command as insiders
 from bench.matcher import command as matcher
+from bench.micro import command as micro
 
 
 def main() -> int:
@@ -58,6 +60,7 @@ def main() -> int:
     matcher.add_arguments(
         commands.add_parser("matcher", help="compare predicted with observed misses, on recorded traces")
     )
+    micro.add_arguments(commands.add_parser("micro", help="count calls, functions and files of one request"))
     scenarios.add_arguments(
         commands.add_parser("scenarios", help="show what is replayed, and the generator beside traces")
     )
@@ -79,6 +82,7 @@ def main() -> int:
         "fleet-day": fleet_day.run,
         "insiders": insiders.run,
         "matcher": matcher.run,
+        "micro": micro.run,
         "report": report.run,
         "scenarios": scenarios.run,
     }

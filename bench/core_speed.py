@@ -58,7 +58,8 @@ class Side:
         self.link.execute(SetReady(ready=True), now)
         self.engine.set_interfaces([interface], now)
         self.offers = (ServiceOffer(SERVICE, TYPE),) if role is Role.CLOUD else ()
-        self.engine.set_offers(self.offers)
+        if role is Role.CLOUD:
+            self.engine.cloud.set_offers(self.offers)
         self.answered = 0
         self.datagrams = 0
 
@@ -86,10 +87,10 @@ class Side:
                 engine.on_link_event(event, now)
             for application_event in engine.take_events():
                 if isinstance(application_event, ExecuteRequest):
-                    engine.complete(application_event.execution, ANSWER, 0.0, now)
+                    engine.cloud.complete(application_event.execution, ANSWER, 0.0, now)
                 elif isinstance(application_event, ResponseArrived):
                     self.answered += 1
-                    engine.judge_answer(application_event.request_id, application_event.copy, None, now)
+                    engine.robot.requests.judge_answer(application_event.request_id, application_event.copy, None, now)
                 elif isinstance(application_event, RequestFailed):
                     raise SystemExit(f"a request failed: {application_event.reason}")
             for _, command in engine.take_commands():
@@ -118,7 +119,7 @@ class Pair:
             self.step()
 
     def _carried(self) -> list[ServiceOffer]:
-        return [ServiceOffer(name, kind) for name, kind in self.robot.engine._offers.offered.items()]
+        return [ServiceOffer(name, kind) for name, kind in self.robot.engine.robot.catalog.offered.items()]
 
     def step(self) -> None:
         """Carry one flight of datagrams each way, or let time pass until a timer is due."""
@@ -144,9 +145,10 @@ class Pair:
     def call(self, payload: bytes, at_once: int) -> None:
         """Send `at_once` requests and wait for all their answers."""
         wanted = self.robot.answered + at_once
+        requests = self.robot.engine.robot.requests
         for _ in range(at_once):
             self.sent += 1
-            self.robot.engine.submit(RequestId(self.sent.to_bytes(16, "big")), SERVICE, payload, self.now)
+            requests.submit(RequestId(self.sent.to_bytes(16, "big")), SERVICE, payload, self.now)
         while self.robot.answered < wanted:
             self.step()
 

@@ -31,7 +31,7 @@ from plr.protos.program.tls_files import load_tls_files
 from plr.sidecar import __main__ as sidecar
 from plr.sidecar import runtime
 from plr.sidecar.core.base.values import RejectReason, RequestId
-from plr.sidecar.core.engine.engine import Engine
+from plr.sidecar.core.cloud.cloud_role import CloudRole
 from plr.sidecar.net import managed_interface
 from plr.sidecar.net.dataplane import ThreadedDataPlane
 
@@ -110,17 +110,17 @@ def _follow_cycle(means: Means) -> None:
 
 
 def _answer_badly(means: Means) -> None:
-    honest = Engine.complete
+    honest = CloudRole.complete
     rng = random.Random(1)
 
-    def complete(engine: Engine, execution: Any, payload: bytes, processing_s: float, now: float) -> None:
+    def complete(cloud: CloudRole, execution: Any, payload: bytes, processing_s: float, now: float) -> None:
         if means.commander.stage is not Stage.HONEST:
             processing_s = 0.0
-            if rng.random() < BAD_ANSWERS and _answer(engine, execution, now):
+            if rng.random() < BAD_ANSWERS and _answer(cloud, execution, now):
                 return
-        honest(engine, execution, payload, processing_s, now)
+        honest(cloud, execution, payload, processing_s, now)
 
-    def _answer(engine: Engine, execution: Any, now: float) -> bool:
+    def _answer(cloud: CloudRole, execution: Any, now: float) -> bool:
         kind = rng.random()
         if kind < 0.2:
             what, bad = "refusals with escape sequences", b""
@@ -132,12 +132,12 @@ def _answer_badly(means: Means) -> None:
             return False
         means.tally.add(what, 1, len(bad))
         if bad:
-            honest(engine, execution, bad, 0.0, now)
+            honest(cloud, execution, bad, 0.0, now)
         else:
-            engine.refuse(execution, RejectReason.OVERLOADED, ESCAPES, now)
+            cloud.refuse(execution, RejectReason.OVERLOADED, ESCAPES, now)
         return True
 
-    change(Engine, "complete", complete)
+    change(CloudRole, "complete", complete)
 
 
 def _ask_much(means: Means) -> None:

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from plr.sidecar import __main__ as sidecar
-from plr.sidecar.core.engine.engine import Engine
+from plr.sidecar.core.cloud.cloud_role import CloudRole
 
 SHARE = ".share"
 GARBAGE_BYTES = 10
@@ -21,16 +21,16 @@ GARBAGE_BYTES = 10
 def main() -> int:
     """Run the sidecar's command line."""
     share_file = Path(sys.argv[sys.argv.index("--config") + 1]).with_suffix(SHARE)
-    honest = Engine.complete
+    honest = CloudRole.complete
 
-    def complete(engine: Engine, execution: Any, payload: bytes, processing_s: float, now: float) -> None:
+    def complete(cloud: CloudRole, execution: Any, payload: bytes, processing_s: float, now: float) -> None:
         share = float(share_file.read_text()) if share_file.exists() else 0.0
         if random.random() < share:
             payload, processing_s = random.randbytes(GARBAGE_BYTES), 0.0
-        honest(engine, execution, payload, processing_s, now)
+        honest(cloud, execution, payload, processing_s, now)
 
     # The change to the program.
-    setattr(Engine, "complete", complete)  # noqa: B010 - it is no method of ours
+    setattr(CloudRole, "complete", complete)  # noqa: B010 - it is no method of ours
     return sidecar.main()
 
 

@@ -151,37 +151,37 @@ class ThreadedDataPlane:
     def submit(self, request_id: RequestId, service: ServiceName, payload: bytes) -> None:
         """Robot: send a serialised request."""
         with self._turn as (engine, now):
-            engine.submit(request_id, service, payload, now)
+            engine.robot.requests.submit(request_id, service, payload, now)
 
     def judge_answer(self, request_id: RequestId, copy: int, problem: str | None) -> None:
         """Robot: note that this copy's answer was delivered to the application, or cannot be because of `problem`."""
         with self._turn as (engine, now):
-            engine.judge_answer(request_id, copy, problem, now)
+            engine.robot.requests.judge_answer(request_id, copy, problem, now)
 
     def answered_here(self, request_id: RequestId) -> None:
         """Robot: note that the application got its answer on the robot."""
         with self._turn as (engine, now):
-            engine.answered_here(request_id, now)
+            engine.robot.requests.answered_here(request_id, now)
 
     def complete(self, execution: ExecutionId, payload: bytes, processing_s: float) -> None:
         """Cloud: send the local server's answer."""
         with self._turn as (engine, now):
-            engine.complete(execution, payload, processing_s, now)
+            engine.cloud.complete(execution, payload, processing_s, now)
 
     def refuse(self, execution: ExecutionId, reason: RejectReason, detail: str) -> None:
         """Cloud: refuse a request that was not or will not be answered."""
         with self._turn as (engine, now):
-            engine.refuse(execution, reason, detail, now)
+            engine.cloud.refuse(execution, reason, detail, now)
 
     def set_offers(self, offers: tuple[ServiceOffer, ...]) -> None:
         """Cloud: replace the services that local servers offer right now."""
         with self._turn as (engine, _):
-            engine.set_offers(offers)
+            engine.cloud.set_offers(offers)
 
     def set_carried(self, services: frozenset[CarriedService]) -> None:
         """Robot: replace the proxied services that exist right now."""
         with self._turn as (engine, _):
-            engine.set_carried(services)
+            engine.robot.set_carried(services)
 
     # -- the control client ---------------------------------------------------------------------------------------
 
@@ -198,7 +198,7 @@ class ThreadedDataPlane:
     def unreached_services(self) -> dict[ServiceName, int]:
         """Return the services for which no offering peer is reached, each with the number of those peers."""
         with self._lock:
-            return self._engine.unreached_services()
+            return self._engine.robot.catalog.unreached
 
     def apply_peers(self, peer_set: PeerSet) -> str | None:
         """Take a view of the peers; return why it is refused, or None."""

@@ -47,16 +47,16 @@ class SerialServer:
                     self.window.remove(execution)
                     self._forget(execution)
                     if isinstance(event, CancelExecution):
-                        self.node.engine.refuse(execution, RejectReason.CANCELLED, "called off", now)
+                        self.node.engine.cloud.refuse(execution, RejectReason.CANCELLED, "called off", now)
                     elif event.awaited:
-                        self.node.engine.refuse(execution, RejectReason.OVERLOADED, "its time here is over", now)
+                        self.node.engine.cloud.refuse(execution, RejectReason.OVERLOADED, "its time here is over", now)
         self._release()
 
     def _release(self) -> None:
         for execution in self.window.release(self.mesh.now):
             if self.expires_at[execution] <= self.mesh.now:
                 self._forget(execution)
-                self.node.engine.refuse(execution, RejectReason.OVERLOADED, "its time is over", self.mesh.now)
+                self.node.engine.cloud.refuse(execution, RejectReason.OVERLOADED, "its time is over", self.mesh.now)
                 continue
             number = next(self._numbers)
             self.window.sent(number, self.mesh.now)
@@ -77,6 +77,6 @@ class SerialServer:
         payload = self._forget(execution).payload
         self.node.executed.append(RequestId(bytes(payload)))
         self.window.answered(number, self.mesh.now)
-        self.node.engine.complete(execution, b"echo:" + payload[:100] + self.answer, self.busy_s, self.mesh.now)
+        self.node.engine.cloud.complete(execution, b"echo:" + payload[:100] + self.answer, self.busy_s, self.mesh.now)
         self._release()
         self.mesh.pump(self.node)

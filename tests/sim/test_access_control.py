@@ -37,7 +37,7 @@ class Fleet:
         self.clouds = [self.mesh.add(name, Role.CLOUD, ["eth0"], rules) for name in ("a", "b")]
         for cloud in self.clouds:
             cloud.offers = (ServiceOffer(SERVICE, TYPE), ServiceOffer(SECRET, TYPE))
-            cloud.engine.set_offers(cloud.offers)
+            cloud.engine.cloud.set_offers(cloud.offers)
         self.planes = JoinedPlanes(self.mesh, policy)
         if rogue:
             self.planes.rogues.add(self.other.name)
@@ -75,7 +75,7 @@ def failures(robot: Node, ids: list[RequestId]) -> list[str]:
 def test_a_robot_gets_nowhere_with_what_it_may_not_call_and_costs_the_others_nothing() -> None:
     fleet = Fleet(POLICY, rogue=True)
     good, rogue = fleet.good, fleet.other
-    assert SECRET in rogue.engine._offers.offered, "the rogue must really try"
+    assert SECRET in rogue.engine.robot.catalog.offered, "the rogue must really try"
     echoes, secrets, permitted, denied = fleet.calls(
         5.0, (good, SERVICE), (good, SECRET), (rogue, SERVICE), (rogue, SECRET)
     )
@@ -96,8 +96,8 @@ def test_a_robot_gets_nowhere_with_what_it_may_not_call_and_costs_the_others_not
 
 def test_an_honest_robot_does_not_even_offer_what_it_may_not_call() -> None:
     fleet = Fleet(POLICY)
-    assert set(fleet.other.engine._offers.offered) == {SERVICE}
-    assert set(fleet.good.engine._offers.offered) == {SERVICE, SECRET}
+    assert set(fleet.other.engine.robot.catalog.offered) == {SERVICE}
+    assert set(fleet.good.engine.robot.catalog.offered) == {SERVICE, SECRET}
     assert {mapping.service for mapping in fleet.other.engine.service_mappings} == {SERVICE}
 
 

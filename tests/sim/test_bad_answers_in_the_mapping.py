@@ -88,7 +88,7 @@ def test_the_only_server_stays_mapped() -> None:
     fleet = Fleet()
     fleet.call(3.0)
     fleet.clouds[1].offers = ()
-    fleet.clouds[1].engine.set_offers(())
+    fleet.clouds[1].engine.cloud.set_offers(())
     fleet.call(60.0)
     assert fleet.servers(fleet.robot) == {"cloud-a"}
     assert "PENALTY" in fleet.explained(fleet.robot)

@@ -28,7 +28,7 @@ def elapsed(seed: int, loss: float) -> list[float]:
     cloud = mesh.add("cloud-a", Role.CLOUD, ["eth0"], rules)
     cloud.offers = mesh.cloud("template").offers
     del mesh.nodes["template"]
-    cloud.engine.set_offers(cloud.offers)
+    cloud.engine.cloud.set_offers(cloud.offers)
     for wire in mesh.both_ways("robot.wlan0", "cloud-a.eth0"):
         wire.delay_s, wire.loss, wire.bytes_per_s = ONE_WAY_S, loss, 100 * MBIT
     make_late(seed, robot, cloud)

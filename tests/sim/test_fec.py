@@ -42,7 +42,7 @@ def pair(
     cloud = mesh.add("cloud-a", Role.CLOUD, ["eth0"], (rule(fec=fec),))
     cloud.offers = mesh.cloud("template").offers
     del mesh.nodes["template"]
-    cloud.engine.set_offers(cloud.offers)
+    cloud.engine.cloud.set_offers(cloud.offers)
     if answer is not None:
         cloud.answer = answer
     for wire in mesh.both_ways("robot.wlan0", "cloud-a.eth0"):

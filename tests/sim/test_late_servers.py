@@ -18,7 +18,7 @@ SERVERLESS_S = 3.0
 def offer_later(mesh: Mesh, node: Node) -> None:
     """Its server has started: the control plane tells everyone."""
     node.offers = (ServiceOffer(SERVICE, TYPE),)
-    node.engine.set_offers(node.offers)
+    node.engine.cloud.set_offers(node.offers)
     mesh.push_views()
 
 
@@ -38,7 +38,7 @@ def test_requests_of_a_time_without_servers_are_answered_by_the_first_that_comes
     robot = mesh.robot("wlan0", "wwan0", rules=(rule(idempotent=idempotent, redundancy=mode),))
     starting, dying = mesh.cloud("cloud-a"), mesh.cloud("cloud-b")
     starting.offers = ()
-    starting.engine.set_offers(())
+    starting.engine.cloud.set_offers(())
     mesh.push_views()
     mesh.run(1.0)
     mapped(mesh, robot, ("wlan0", "cloud-b"), ("wwan0", "cloud-b"))
@@ -65,14 +65,14 @@ def test_what_the_only_server_had_when_its_process_ended_runs_on_the_next_one(
     robot = mesh.robot("wlan0", "wwan0", rules=(rule(redundancy=mode, lifetime_s=30.0),))
     starting, dying = mesh.cloud("cloud-a"), mesh.cloud("cloud-b")
     starting.offers = ()
-    starting.engine.set_offers(())
+    starting.engine.cloud.set_offers(())
     mesh.push_views()
     mesh.run(1.0)
     mapped(mesh, robot, ("wlan0", "cloud-b"), ("wwan0", "cloud-b"))
 
     def lose(event: ApplicationEvent) -> None:
         if isinstance(event, ExecuteRequest):
-            dying.engine.refuse(event.execution, RejectReason.SERVER_LOST, "the server's process ended", mesh.now)
+            dying.engine.cloud.refuse(event.execution, RejectReason.SERVER_LOST, "the server's process ended", mesh.now)
 
     dying.server = lose
     asked = call_at(mesh, robot, 20, 0.2)
@@ -155,8 +155,8 @@ def test_a_server_that_is_not_there_yet_is_asked_again(mode: RedundancyMode, ide
     cloud = mesh.cloud("cloud-a")
     mesh.push_views()
     mesh.run(1.0)
-    cloud.engine.set_offers(())
-    mesh.at(1.5, lambda: cloud.engine.set_offers(cloud.offers))
+    cloud.engine.cloud.set_offers(())
+    mesh.at(1.5, lambda: cloud.engine.cloud.set_offers(cloud.offers))
     asked = call_at(mesh, robot, 40, 3.0)
     mesh.run(5.0)
     assert [event for event in robot.events if isinstance(event, RequestFailed)] == []

@@ -288,7 +288,7 @@ def test_a_mapping_that_names_the_unknown_is_refused_and_the_old_one_stays() -> 
         error = mesh.push_mapping(robot, MappingSet(Version(8), 2, (bad,)))
         assert error is not None
         assert interface in error or server in error
-    assert robot.engine.mapping.version == 7
+    assert robot.engine.robot.mapping.version == 7
 
 
 @pytest.mark.parametrize("seed", range(15))

@@ -29,12 +29,12 @@ class World:
         self.up, self.down = self.mesh.both_ways("robot.wlan0", "cloud-a.eth0")
         for wire in (self.up, self.down):
             wire.delay_s, wire.bytes_per_s = delay_s, rate
-        complete = cloud.engine.complete
+        complete = cloud.engine.cloud.complete
 
         def answer(execution: ExecutionId, payload: bytes, server_s: float, now: float) -> None:
             complete(execution, payload[:9], server_s, now)
 
-        cloud.engine.complete = answer  # type: ignore[method-assign,assignment]  # an echo of 100 kB would pace both ways
+        cloud.engine.cloud.complete = answer  # type: ignore[method-assign,assignment]  # an echo of 100 kB would pace both ways
         self.mesh.run(1.0)
 
     @property

@@ -19,7 +19,7 @@ def test_requests_that_their_server_never_got_run_elsewhere() -> None:
     server = SerialServer(mesh, slow, busy_s=100.0)
     other = mesh.cloud("b")
     slow.offers = other.offers
-    slow.engine.set_offers(slow.offers)
+    slow.engine.cloud.set_offers(slow.offers)
     wires = mesh.both_ways("robot.wlan0", "b.eth0")
     mesh.push_views()
     for wire in wires:

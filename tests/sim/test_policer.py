@@ -196,12 +196,12 @@ def test_requests_get_through_a_policer_and_no_repair_symbols_are_sent_for_what_
     mesh, rate, size, hz, seconds = Mesh(seed), 10 * MBIT, 200_000, 12.5, 12.0
     robot = mesh.robot("wlan0", rules=(rule(deadline_s=2.0, lifetime_s=10.0),))
     cloud = mesh.cloud("cloud-a")
-    complete = cloud.engine.complete
+    complete = cloud.engine.cloud.complete
 
     def answer(execution: ExecutionId, payload: bytes, server_s: float, now: float) -> None:
         complete(execution, payload[:9], server_s, now)
 
-    cloud.engine.complete = answer  # type: ignore[method-assign,assignment]  # an echo would be policed by nobody
+    cloud.engine.cloud.complete = answer  # type: ignore[method-assign,assignment]  # an echo would be policed by nobody
     mesh.push_views()
     mesh.run(1.0)
     up, _ = mesh.both_ways("robot.wlan0", "cloud-a.eth0")

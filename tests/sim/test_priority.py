@@ -21,7 +21,7 @@ def slowest_urgent_call(bulk: Priority) -> float:
     robot = mesh.robot("wlan0", rules=rules)
     cloud = mesh.cloud("cloud-a")
     cloud.offers = (ServiceOffer(SERVICE, TYPE), ServiceOffer(BULK, TYPE))
-    cloud.engine.set_offers(cloud.offers)
+    cloud.engine.cloud.set_offers(cloud.offers)
     for wire in mesh.both_ways("robot.wlan0", "cloud-a.eth0"):
         wire.bytes_per_s = 500_000
     mesh.push_views()

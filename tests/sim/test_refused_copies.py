@@ -36,7 +36,7 @@ def test_a_refused_copy_that_is_cut_again_does_not_run_beside_the_rescue(light_a
         for wire in mesh.all_wires_of("robot.wwan0"):
             wire.cut = False
 
-    near.engine.set_offers(())
+    near.engine.cloud.set_offers(())
     for cloud in (near, far):
         mesh.wire(f"{cloud.name}.eth0", "robot.wlan0").cut = True
     robot.submit(bytes(3000))
@@ -44,7 +44,7 @@ def test_a_refused_copy_that_is_cut_again_does_not_run_beside_the_rescue(light_a
     assert near.engine.stats.dropped["request_for_unknown_service"] == 1
     for wire in mesh.all_wires_of("robot.wlan0"):
         wire.cut = True
-    mesh.at(0.5, lambda: near.engine.set_offers(near.offers))
+    mesh.at(0.5, lambda: near.engine.cloud.set_offers(near.offers))
     mesh.at(light_after_s, light)
     mesh.run(20.0)
     assert [len(cloud.executed) for cloud in (near, far)] == [0, 1]
@@ -61,9 +61,9 @@ def test_a_server_that_takes_long_to_start_is_asked_until_it_is_there(away_s: fl
     cloud = mesh.cloud("cloud-a")
     mesh.push_views()
     mesh.run(2.0)
-    cloud.engine.set_offers(())
+    cloud.engine.cloud.set_offers(())
     robot.submit(b"job")
-    mesh.at(away_s, lambda: cloud.engine.set_offers(cloud.offers))
+    mesh.at(away_s, lambda: cloud.engine.cloud.set_offers(cloud.offers))
     for second in range(0, int(away_s), 2):
         for cut in (True, False):
             mesh.at(second + (0.1 if cut else 1.1), partial(_cut, mesh, cut=cut))
@@ -90,7 +90,7 @@ def test_who_is_refused_waits_for_the_server_that_is_out_of_reach(reason: Reject
 
     def refuse(event: ApplicationEvent) -> None:
         if isinstance(event, ExecuteRequest):
-            bad.engine.refuse(event.execution, reason, "no", bad.now)
+            bad.engine.cloud.refuse(event.execution, reason, "no", bad.now)
 
     bad.server = refuse
     mesh.push_views()
@@ -115,7 +115,7 @@ def test_who_waits_for_a_server_out_of_reach_ends_with_the_reason_of_the_one_tha
     bad = mesh.cloud("cloud-a")
     mesh.cloud("cloud-b")
     bad.server = lambda event: (
-        bad.engine.refuse(event.execution, RejectReason.OVERLOADED, "too much", bad.now)
+        bad.engine.cloud.refuse(event.execution, RejectReason.OVERLOADED, "too much", bad.now)
         if isinstance(event, ExecuteRequest)
         else None
     )

@@ -23,11 +23,11 @@ def test_a_server_may_be_away_for_nearly_a_whole_lifetime(interfaces: tuple[str,
     cloud = mesh.cloud("a")
     mesh.push_views()
     mesh.run(2)
-    cloud.engine.set_offers(())
+    cloud.engine.cloud.set_offers(())
     for number in range(5):
         robot.submit(b"%d" % number)
     mesh.run(20)
-    cloud.engine.set_offers(cloud.offers)
+    cloud.engine.cloud.set_offers(cloud.offers)
     mesh.run(5)
     assert len(robot.responses()) == 5
     assert len(cloud.executed) == 5
@@ -60,13 +60,13 @@ def test_what_waited_for_room_at_a_server_that_went_dark_is_sent_when_it_is_back
     first.engine.drain()
     waits = robot.submit(bytes(SIZE - 1000))
     mesh.run(1)
-    assert waits in robot.engine._requests._no_room._waiting
+    assert waits in robot.engine.robot.requests._no_room._waiting
     for wire in to_second:
         wire.cut = True
     mesh.run(4)
     robot.submit(b"its end lets the line be looked at")
     mesh.run(2)
-    assert waits not in robot.engine._requests._no_room._waiting
+    assert waits not in robot.engine.robot.requests._no_room._waiting
     for wire in to_second:
         wire.cut, wire.bytes_per_s = False, 0
     mesh.run(10)
@@ -85,7 +85,7 @@ def test_what_misses_its_deadline_does_not_take_the_room_of_what_is_next(monkeyp
     robot = mesh.robot("wlan0", rules=rules)
     cloud = mesh.add("a", Role.CLOUD, ["eth0"], rules)
     cloud.offers = (ServiceOffer(bulk, TYPE), ServiceOffer(urgent, TYPE))
-    cloud.engine.set_offers(cloud.offers)
+    cloud.engine.cloud.set_offers(cloud.offers)
     mesh.wire("robot.wlan0", "a.eth0").bytes_per_s = 2e6
     mesh.push_views()
     mesh.run(2)
@@ -96,5 +96,5 @@ def test_what_misses_its_deadline_does_not_take_the_room_of_what_is_next(monkeyp
         for _ in range(2):
             robot.submit(bytes(300_000), urgent)
         mesh.run(0.1)
-    request = robot.engine._requests._requests.get(waits)
+    request = robot.engine.robot.requests._requests.get(waits)
     assert request is None or request.copies

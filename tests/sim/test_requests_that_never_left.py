@@ -27,7 +27,7 @@ def backlog(size: int = 60_000, lifetime_s: float = 30.0) -> tuple[Mesh, Node, N
     for number in range(COUNT):
         robot.submit(number.to_bytes(4, "big") + bytes(size))
     mesh.run(1.0)
-    requests = robot.engine._requests._requests.of(SERVICE)
+    requests = robot.engine.robot.requests._requests.of(SERVICE)
     unsent = {request.id for request in requests if not any(copy.message.symbols.begun for copy in request.copies)}
     assert len(unsent) > COUNT / 2
     return mesh, robot, near, far, set(unsent)
@@ -58,7 +58,7 @@ def test_also_when_the_others_have_no_room_for_all_of_them(monkeypatch: pytest.M
     near.start()
     mesh.push_views()
     mesh.run(0.001)
-    assert len(robot.engine._requests._no_room) > COUNT / 3
+    assert len(robot.engine.robot.requests._no_room) > COUNT / 3
     mesh.run(30.0)
     near.executed += ran_before
     assert_only_what_left_is_lost(robot, unsent, near, far)

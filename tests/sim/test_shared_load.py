@@ -37,12 +37,12 @@ class World:
 
     @staticmethod
     def _answer_shortly(cloud: Node) -> None:
-        complete = cloud.engine.complete
+        complete = cloud.engine.cloud.complete
 
         def answer(execution: ExecutionId, payload: bytes, server_s: float, now: float) -> None:
             complete(execution, payload[:9], server_s, now)
 
-        cloud.engine.complete = answer  # type: ignore[method-assign,assignment]  # an echo would fill both ways
+        cloud.engine.cloud.complete = answer  # type: ignore[method-assign,assignment]  # an echo would fill both ways
 
     def elapsed(self, seconds: float) -> list[float]:
         """Send requests for so long; returns how long each took, infinity without an answer."""

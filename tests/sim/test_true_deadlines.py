@@ -54,7 +54,7 @@ class Told:
         self.seen.append((number, event.deadline_s - max(left_s, 0.0), event.expires_s - lifetime_left_s))
 
         def answer() -> None:
-            self.cloud.engine.complete(event.execution, bytes(event.payload[:4]), 0.001, self.mesh.now)
+            self.cloud.engine.cloud.complete(event.execution, bytes(event.payload[:4]), 0.001, self.mesh.now)
             self.mesh.pump(self.cloud)
 
         self.mesh.at(0.001, answer)

@@ -94,7 +94,8 @@ class Node:
         self.thread.start()
         self.plane.set_links({InterfaceName("lo"): self.thread})
         self.thread.post(SetReady(ready=True))
-        self.plane.set_offers(self.offers)
+        if self.offers:
+            self.plane.set_offers(self.offers)
         assert self.plane.apply_peers(PeerSet(Version(1), 1, (other.told_to(self),))) is None
 
     def stop(self) -> None:

@@ -116,7 +116,8 @@ class Node:
         for link in self.links.values():
             link.execute(SetReady(ready=True), now)
         self.engine.set_interfaces(self.links, now)
-        self.engine.set_offers(self.offers)
+        if self.role is Role.CLOUD:
+            self.engine.cloud.set_offers(self.offers)
         self.executed: list[RequestId | int] = []
         self.inbox: list[tuple[InterfaceName, bytes, Address]] = []
         self.awaits_turn = False
@@ -163,7 +164,7 @@ class Node:
     def submit(self, payload: bytes, service: ServiceName = SERVICE) -> RequestId:
         self.sequence += 1
         request_id = make_request_id(self.session, b"guid", self.sequence)
-        self.engine.submit(request_id, service, payload, self.now)
+        self.engine.robot.requests.submit(request_id, service, payload, self.now)
         self.mesh.pump(self)
         return request_id
 
@@ -227,7 +228,7 @@ class Mesh:
     def cloud(self, name: str) -> Node:
         node = self.add(name, Role.CLOUD, ["eth0"], (rule(),))
         node.offers = (ServiceOffer(SERVICE, TYPE),)
-        node.engine.set_offers(node.offers)
+        node.engine.cloud.set_offers(node.offers)
         return node
 
     def wire(self, source: str, destination: str) -> Wire:
@@ -349,7 +350,7 @@ class Mesh:
         node.events.append(event)
         if isinstance(event, ResponseArrived):
             problem = node.judge(bytes(event.payload))
-            node.engine.judge_answer(event.request_id, event.copy, problem, node.now)
+            node.engine.robot.requests.judge_answer(event.request_id, event.copy, problem, node.now)
         if node.server is not None:
             node.server(event)
         elif isinstance(event, ExecuteRequest):
@@ -361,12 +362,12 @@ class Mesh:
 
             def answer() -> None:
                 if node.alive and node.session == session:
-                    node.engine.complete(execution, node.answer(bytes(event.payload)), delay, node.now)
+                    node.engine.cloud.complete(execution, node.answer(bytes(event.payload)), delay, node.now)
                     self.pump(node)
 
             self.at(delay, answer)
         elif type(event).__name__ == "OfferService":
-            node.engine.set_carried(frozenset(map(CarriedService, node.engine._offers.offered)))
+            node.engine.robot.set_carried(frozenset(map(CarriedService, node.engine.robot.catalog.offered)))
 
     def _carry(self, source: Address, destination: Address, data: bytes) -> None:
         if self.tap is not None:

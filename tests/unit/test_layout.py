@@ -118,9 +118,8 @@ controlplane/core/solve/server_groups.py
 sidecar/core/base/report_scope.py
 sidecar/core/base/values.py
 sidecar/core/cloud/answer_cache.py
-sidecar/core/cloud/serving.py
-sidecar/core/engine/attention.py
 sidecar/core/engine/revocation_exchange.py
+sidecar/core/engine/role.py
 sidecar/core/link/liveness.py
 sidecar/core/link/path_table.py
 sidecar/core/link/receiver.py
@@ -143,6 +142,7 @@ sidecar/core/seam/stats.py
 sidecar/core/stun/events.py
 sidecar/core/stun/family.py
 sidecar/core/stun/transaction.py
+sidecar/core/transfer/engine_parts.py
 sidecar/core/transfer/inbound.py
 sidecar/core/transfer/room.py
 """.split()

@@ -1,4 +1,4 @@
-"""Replaces what stands between `<!-- generated: NAME -->` and `<!-- end -->` in a page."""
+"""Replaces what stands between `<!-- generated: NAME -->` and `<!-- end of generated -->` in a page."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-_BLOCK = re.compile(r"(<!-- generated: ([\w-]+) -->\n)(?:.*?)(<!-- end -->)", re.DOTALL)
+_BLOCK = re.compile(r"(<!-- generated: ([\w-]+) -->\n)(?:.*?)(<!-- end of generated -->)", re.DOTALL)
 
 
 def replace_blocks(page: str, texts: Mapping[str, str]) -> str:

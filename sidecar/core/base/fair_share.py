@@ -31,13 +31,13 @@ class Shares:
 
     def fits(self, peer: NodeName, units: int = 1) -> bool:
         """Return whether the peer may take this many more."""
-        return self.held(peer) + units <= self.capacity - self.used
+        return self._held.get(peer, 0) + units <= self.capacity - self.used
 
     def take(self, peer: NodeName, units: int = 1) -> None:
         """Give the peer these units; the caller asks `fits` before."""
         if not units:
             return
-        self._held[peer] = self.held(peer) + units
+        self._held[peer] = self._held.get(peer, 0) + units
         self.used += units
 
     def give_back(self, peer: NodeName, units: int = 1) -> None:

@@ -39,6 +39,7 @@ if TYPE_CHECKING:
     from plr.sidecar.core.seam.stats import EngineStats
     from plr.sidecar.core.transfer.outbox import Outbox
     from plr.sidecar.core.transfer.routes import Routes
+    from plr.sidecar.core.wire.messages import Encoded
 
 MAX_ANSWERS = 32_768
 """Most answers and rejections waiting or under way; one robot may have half: twice what it may have in flight."""
@@ -61,8 +62,10 @@ class _Answer:
     number: int
     reply: Reply
     """The reply to the first copy that asked."""
+    content: Encoded
+    """That reply as a message. Those to other copies are equally long."""
     size: int
-    """Bytes of one message that carries it."""
+    """Bytes of one of these messages."""
     waiting: dict[int, PathId] = field(default_factory=dict)
     """Copies it was not sent to yet, and the paths they came by."""
     sent: dict[int, PathId] = field(default_factory=dict)
@@ -143,12 +146,29 @@ class Answers:
 
     def send(self, replies: list[Reply], now: float) -> None:
         """Send these replies as soon as there is room."""
+        if len(replies) == 1 and self._send_alone(replies[0], now):
+            return
         for reply in replies:
             self._take(reply, now)
         for reply in replies:
             # As many as came: these, or others that have waited longer. A robot without room has none for a second one.
             self._send_next(reply.waiter.path.peer, now)
         self._let_go((reply.waiter.path.peer for reply in replies), now)
+
+    def _send_alone(self, reply: Reply, now: float) -> bool:
+        """Send a reply at once if nothing waits for its robot; return False if it has to wait or is known."""
+        path = reply.waiter.path
+        if path.peer in self._lines or self._known(path.peer, reply) is not None:
+            return False
+        answer = self._enter(reply, now)
+        if answer is None:
+            return True  # counted
+        answer.waiting[reply.waiter.copy] = path
+        if self._outbox.has_room(path.peer, answer.size):
+            self._send(answer, reply.waiter.copy)
+        else:
+            self._line_up(answer)
+        return True
 
     def _take(self, reply: Reply, now: float) -> None:
         copy, path = reply.waiter.copy, reply.waiter.path
@@ -157,8 +177,7 @@ class Answers:
             answer = self._enter(reply, now)
             if answer is not None:
                 answer.waiting[copy] = path
-                line = self._lines_of(answer).firsts
-                line.add(answer.number, reply.priority, reply.deadline, answer.size)
+                self._line_up(answer)
         elif copy not in answer.waiting and copy not in answer.sent:
             answer.waiting[copy] = path
             if answer.sent:
@@ -178,7 +197,8 @@ class Answers:
         return None
 
     def _enter(self, reply: Reply, now: float) -> _Answer | None:
-        answer = _Answer(next(self._numbers), reply, encode_message(reply.message).size)
+        content = encode_message(reply.message)
+        answer = _Answer(next(self._numbers), reply, content, content.size)
         robot, held = answer.robot, answer.held
         if not self._number_shares.fits(robot):
             self._stats.dropped["answers_full"] += 1
@@ -292,9 +312,10 @@ class Answers:
         if self._routes.state(path) is PathState.DOWN:
             path = self._routes.best_to(path.peer) or path
         rule = self._rules.find(reply.service)
+        message = reply.message
         self._outbox.send(
             path,
-            encode_message(replace(reply.message, copy=copy)),
+            answer.content if copy == message.copy else encode_message(replace(message, copy=copy)),
             priority=reply.priority,
             deadline=reply.deadline,
             expires=reply.expires,
@@ -302,6 +323,10 @@ class Answers:
             answers=answer.request_id,
             siblings=answer.messages if answer.lane is Lane.LARGE and not is_race(answer.request_id) else None,
         )
+
+    def _line_up(self, answer: _Answer) -> None:
+        line = self._lines_of(answer).firsts
+        line.add(answer.number, answer.reply.priority, answer.reply.deadline, answer.size)
 
     def _line_up_copies(self, answer: _Answer, copies: Iterable[int]) -> None:
         reply = answer.reply

@@ -228,6 +228,7 @@ class ExecutionTable:
         self._running_bytes.take(path.peer, size)
         self._by_request[key] = execution
         self._running[execution.id] = execution
+        self._stats.in_flight = len(self._running)
         self._arm(execution)
         count[message.service, "run"] += 1
         return ExecuteRequest(
@@ -370,15 +371,17 @@ class ExecutionTable:
         if execution is None:
             self._stats.dropped["answer_to_unknown_execution"] += 1
             return None
+        self._stats.in_flight = len(self._running)
         del self._by_request[execution.key]
-        self._running_shares.give_back(execution.robot)
-        self._running_bytes.give_back(execution.robot, execution.size)
+        robot = execution.key.robot
+        self._running_shares.give_back(robot)
+        self._running_bytes.give_back(robot, execution.size)
         return execution
 
     def _remember(self, execution: _Execution, now: float) -> None:
         """Remember an execution that ran or may have run, so that it never runs again."""
         self._finished[execution.key] = execution
-        self._finished_shares.take(execution.robot)
+        self._finished_shares.take(execution.key.robot)
         forget_at = now + max(REMEMBER_LIFETIMES * execution.lifetime_s, MIN_REMEMBER_S)
         heapq.heappush(self._forget_at, (forget_at, execution.key))
 

@@ -1,36 +1,26 @@
-"""Holds the sidecar's requests, peers and routes, which all links share. Sans-IO; the caller serialises the calls.
+"""Holds a sidecar's role, peers, routes and messages, which all links share. Sans-IO; the caller serialises the calls.
 
 Inputs are method calls with `now`; outputs are `take_commands` (for the links) and `take_events` (for the
-application). Nothing here builds, seals or parses a datagram.
+application). Nothing here builds, seals or parses a datagram. What only one of the roles does is in its object.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from functools import partial
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from plr.protos.base.errors import DecodeError, UnknownKindError
 from plr.protos.model.ids import Role
-from plr.protos.model.members import MAX_PEERS, PeerSet, RemovalReason, ServiceUse
+from plr.protos.model.members import RemovalReason
 from plr.sidecar.core.base.report_scope import ReportScope
-from plr.sidecar.core.base.slices import SLICE, Backlog, Step, rest
-from plr.sidecar.core.base.values import ExecutionId, PathId, PathState, RejectReason, RequestId
-from plr.sidecar.core.cloud.serving import Serving, ServingParts
-from plr.sidecar.core.engine.attention import Attention
+from plr.sidecar.core.base.slices import SLICE, Backlog
+from plr.sidecar.core.base.values import PathId, PathState
+from plr.sidecar.core.cloud.cloud_role import CloudRole
 from plr.sidecar.core.engine.peers import Peers
 from plr.sidecar.core.engine.revocation_exchange import RevocationExchange
-from plr.sidecar.core.robot.dispatch.context import RequestParts
-from plr.sidecar.core.robot.dispatch.penalties import Penalties
-from plr.sidecar.core.robot.goodbyes import Goodbyes
-from plr.sidecar.core.robot.measure.measurements import Measurements
-from plr.sidecar.core.robot.request.mapping_table import MappingTable
-from plr.sidecar.core.robot.request.service_catalog import Offers
-from plr.sidecar.core.robot.request_table import RequestTable
+from plr.sidecar.core.robot.robot_role import RobotRole
 from plr.sidecar.core.rules.service_rule import Rules, ServiceRule
-from plr.sidecar.core.seam.application import ApplicationEvent, CarriedService, OfferService, WithdrawService
 from plr.sidecar.core.seam.links import (
-    Attend,
     FinishedLost,
     FragmentsLost,
     FragmentsReceived,
@@ -47,33 +37,27 @@ from plr.sidecar.core.seam.links import (
     PeerLied,
     PeerRenewed,
     PeerRestarted,
-    Seek,
     SetPeers,
 )
 from plr.sidecar.core.seam.stats import EngineStats
+from plr.sidecar.core.transfer.engine_parts import EngineParts
 from plr.sidecar.core.transfer.inbound import Inbound
 from plr.sidecar.core.transfer.outbox import Outbox
 from plr.sidecar.core.transfer.routes import Routes
-from plr.sidecar.core.wire.messages import (
-    CancelMessage,
-    RequestMessage,
-    ResponseMessage,
-    RevocationLists,
-    RevocationsHeld,
-    RevocationsWanted,
-    decode_message,
-)
+from plr.sidecar.core.wire.messages import RevocationMessage, decode_message
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Iterable, Iterator
+    from collections.abc import Collection, Iterable
 
     from plr.protos.model.ids import InterfaceName, NodeName, ServiceName, SessionId
     from plr.protos.model.mapping import MappingSet, ServiceMapping
-    from plr.protos.model.members import Peer, ServiceOffer
+    from plr.protos.model.members import Peer, PeerSet, ServiceOffer, ServiceUse
     from plr.protos.model.report import Report
     from plr.sidecar.core.crypto.session import OwnSession
+    from plr.sidecar.core.engine.role import EngineRole
     from plr.sidecar.core.message.decoding import Decoding
     from plr.sidecar.core.rules.budget import Budget
+    from plr.sidecar.core.seam.application import ApplicationEvent
 
 SWEEP_EVERY_S = 1.0
 """Interval of the search for old messages and partial messages."""
@@ -89,67 +73,58 @@ class EngineConfig:
     """Robot: budgets, of which the first that matches an interface's name decides."""
 
 
+class WrongRoleError(RuntimeError):
+    """The caller took this sidecar for one of the other role."""
+
+
 class Engine:
     """One sidecar without its sockets, its clock and ROS."""
 
     def __init__(self, config: EngineConfig, own: OwnSession, now: float) -> None:
-        self._config = config
-        self._rules = Rules(config.rules)
         self._backlog = Backlog()
         self.stats = EngineStats()
-        self._commands: list[tuple[InterfaceName | None, LinkCommand]] = []
+        self._commands: list[LinkCommand] = []
         self._events: list[ApplicationEvent] = []
         self._interfaces: set[InterfaceName] = set()
-        self._away: dict[NodeName, SessionId] = {}
-        """Cloud: robots that fell silent, are no peers any more, and may come back with this session."""
-        self._carried: frozenset[CarriedService] = frozenset()
-        self._services_changed = False
-        """Whether `offers` or `uses` may have changed since the last `take_services_changed`."""
         self._sweep_at = now + SWEEP_EVERY_S
-        self._attention = Attention(now)
-        self._inbound = Inbound(self._to_link, self.stats, answers=config.role is Role.CLOUD)
+        self._inbound = Inbound(self._commands.append, self.stats, answers=config.role is Role.CLOUD)
         self.peers = Peers(own, self.stats.dropped)
         self.routes = Routes()
-        self.mapping = MappingTable(self.routes)
-        self._offers = Offers(self._rules, self.stats, budgeted=any(one.limits for one in config.budgets))
-        self._outbox = Outbox(self.routes, self._to_link, self.stats)
+        self._outbox = Outbox(self.routes, self._commands.append, self.stats)
         self.revocations = RevocationExchange(self.routes, self._outbox, self.stats)
-        self._measurements = Measurements(self.stats.dropped)
-        self._penalties = Penalties()
-        self._goodbyes = Goodbyes()
-        self._serving = Serving(
-            ServingParts(
-                self._rules,
-                self.routes,
-                self._outbox,
-                self.stats,
-                self._events.append,
-                self.peers.may_call,
-                self._backlog,
-            )
+        parts = EngineParts(
+            Rules(config.rules),
+            self.peers,
+            self.routes,
+            self._outbox,
+            self.stats,
+            self._events.append,
+            self._commands.append,
+            self._backlog,
         )
-        self._requests = RequestTable(
-            RequestParts(
-                self._offers,
-                self.mapping,
-                self.routes,
-                self._outbox,
-                self._measurements,
-                self.stats,
-                self._events.append,
-                self._seek,
-                config.budgets,
-                self._backlog,
-                penalties=self._penalties,
-            )
-        )
+        self._role: EngineRole = RobotRole(parts, config.budgets) if config.role is Role.ROBOT else CloudRole(parts)
+
+    @property
+    def robot(self) -> RobotRole:
+        """Return the robot's part; raise WrongRoleError in a cloud's sidecar."""
+        if not isinstance(self._role, RobotRole):
+            raise WrongRoleError("a cloud sends no requests")
+        return self._role
+
+    @property
+    def cloud(self) -> CloudRole:
+        """Return the cloud's part; raise WrongRoleError in a robot's sidecar."""
+        if not isinstance(self._role, CloudRole):
+            raise WrongRoleError("a robot runs no requests")
+        return self._role
 
     # -- outputs --------------------------------------------------------------------------------------------------
 
     def take_commands(self) -> list[tuple[InterfaceName | None, LinkCommand]]:
         """Return the commands for the links; None as interface means all of them."""
-        commands, self._commands = self._commands, []
-        return commands
+        commands = self._commands[:]
+        self._commands.clear()
+        return [(command.path.interface if isinstance(command, PathCommand) else None, command) for command in commands]
 
     def take_events(self) -> list[ApplicationEvent]:
         """Return the events for the application."""
@@ -166,82 +141,34 @@ class Engine:
         """Return the number of messages to decode."""
         return self._inbound.decodings
 
-    def _to_link(self, command: PathCommand) -> None:
-        self._commands.append((command.path.interface, command))
+    def _tell_links_of_peers(self) -> None:
+        self._commands.append(SetPeers(self.peers.for_links()))
 
-    def _seek(self, peers: frozenset[NodeName]) -> None:
-        self._commands.append((None, Seek(peers)))
-
-    # -- the application's calls ----------------------------------------------------------------------------------
-
-    def submit(self, request_id: RequestId, service: ServiceName, payload: bytes, now: float) -> None:
-        """Robot: send a serialised request."""
-        rule = self._rules.find(service)
-        kind = self._offers.offered.get(service)
-        if rule is None or kind is None:
-            self._requests.reject(request_id, service, "no server offers this service any more")
-            return
-        servers = frozenset(self._offers.servers(service))
-        if self._attention.needs(servers, now):
-            self._commands.append((None, Attend(servers)))
-        self._requests.submit(request_id, service, kind, rule, payload, now)
-        self._count_in_flight()
-
-    def judge_answer(self, request_id: RequestId, copy: int, problem: str | None, now: float) -> None:
-        """Robot: note that this copy's answer was delivered to the application, or cannot be because of `problem`."""
-        self._requests.judge_answer(request_id, copy, problem, now)
-        self._count_in_flight()
-
-    def answered_here(self, request_id: RequestId, now: float) -> None:
-        """Robot: note that the application got its answer on the robot."""
-        self._requests.answered_here(request_id, now)
-        self._count_in_flight()
-
-    def complete(self, execution: ExecutionId, payload: bytes, processing_s: float, now: float) -> None:
-        """Cloud: send the local server's answer."""
-        self._serving.complete(execution, payload, processing_s, now)
-        self._count_in_flight()
-
-    def refuse(self, execution: ExecutionId, reason: RejectReason, detail: str, now: float) -> None:
-        """Cloud: refuse a request that was not or will not be answered."""
-        self._serving.refuse(execution, reason, detail, now)
-        self._count_in_flight()
-
-    def set_offers(self, offers: Iterable[ServiceOffer]) -> None:
-        """Cloud: replace the services that local servers offer right now."""
-        self._serving.set_offers(offers)
-        self._services_changed = True
-
-    def set_carried(self, services: frozenset[CarriedService]) -> None:
-        """Robot: replace the proxied services that exist right now."""
-        self._carried = services
-        self._services_changed = True
+    # -- the program ----------------------------------------------------------------------------------------------
 
     def drain(self) -> None:
-        """Cloud: take no new requests; those in flight go on."""
-        self._serving.drain()
+        """Take no new requests from peers; those in flight go on."""
+        self._role.drain()
 
     @property
     def busy(self) -> int:
         """Return the number of requests and messages in flight that somebody still waits for: reasons not to exit."""
         peers = frozenset(self.peers.names())
-        messages = sum(self._outbox.messages_to(peer) for peer in peers)
-        return self._serving.awaited(peers) + self._requests.unanswered + messages
+        return self._role.awaited(peers) + sum(self._outbox.messages_to(peer) for peer in peers)
 
     # -- the control plane ----------------------------------------------------------------------------------------
 
     def offers(self) -> tuple[ServiceOffer, ...]:
         """Return the services that this sidecar can run."""
-        return self._serving.offers
+        return self._role.offers()
 
     def uses(self) -> tuple[ServiceUse, ...]:
         """Return the services that this sidecar carries."""
-        return self._offers.uses(self._carried)
+        return self._role.uses()
 
     def take_services_changed(self) -> bool:
         """Return whether `offers` or `uses` may have changed since the last call."""
-        changed, self._services_changed = self._services_changed, False
-        return changed
+        return self._role.take_services_changed()
 
     def set_interfaces(self, interfaces: Iterable[InterfaceName], now: float) -> None:
         """Replace the interfaces that have a link now."""
@@ -252,11 +179,11 @@ class Engine:
             paths = self.routes.forget_interface(interface)
             self._backlog.add_steps(self._outbox.on_interface_gone(interface), now)
             for path in paths:
-                self._requests.on_path_changed(path, PathState.DOWN, now)
+                self._role.on_path_gone(path, now)
             dark = dict.fromkeys(path.peer for path in paths if not self.routes.reaches(path.peer))
             self._drop_unlisted(dark, now)
-        self._update_offers(now)
-        self._commands.append((None, SetPeers(self.peers.for_links())))
+        self._role.on_reach_changed(now)
+        self._tell_links_of_peers()
 
     def apply_peers(self, peer_set: PeerSet, now: float) -> str | None:
         """Take a view of the peers; return why it is refused, or None."""
@@ -267,57 +194,26 @@ class Engine:
             self.stats.nacks += 1
             return error
         self.stats.peers_version = self.peers.version
-        self._commands.append((None, SetPeers(self.peers.for_links())))
-        self._follow_offers(now)
+        self._tell_links_of_peers()
+        self._role.on_peers_changed(now)
         ended = [name for name, session in before.items() if self.peers.session(name) != session]
         for name in ended:
             over = name in self.peers or name in left or name in self.peers.refused
             self._forget_session(name, now, may_return=None if over else before[name])
         self._follow_gone(ended, now)
-        self._end_away(left, now)
-        self._goodbyes.follow(self.peers.session)
+        self._role.on_view(left | self.peers.refused.keys(), now)
         return None
-
-    def _end_away(self, left: Collection[NodeName], now: float) -> None:
-        """Forget the peers that might have come back: some have, and others never will."""
-        for name, session in list(self._away.items()):
-            if self.peers.session(name) == session:
-                del self._away[name]
-            elif name in self.peers or name in left or name in self.peers.refused:
-                self._forget_session(name, now)
-
-    def _follow_offers(self, now: float) -> None:
-        """Follow the peers' offers, as the peers or their services may have changed."""
-        if self._config.role is Role.ROBOT:
-            self._backlog.add(self._take_offers, now, "offers")
-
-    def _take_offers(self) -> Iterator[Step]:
-        for name in (*self.peers.names(), *self._offers.others(self.peers)):
-            yield partial(self._take_offers_of, name)
-            yield from _REST  # a peer may offer hundreds of services
-        yield self._update_offers
-
-    def _take_offers_of(self, name: NodeName, _now: float) -> None:
-        peer = self.peers.get(name)
-        if peer is not None:
-            self._offers.set_peer(peer)
-        else:
-            self._offers.forget_peer(name)
 
     def services_of_peers(self) -> set[ServiceName]:
         """Return the services that the peers offer, whatever their names."""
         peers = map(self.peers.get, self.peers.names())
         return {offer.name for peer in peers if peer is not None for offer in peer.offers}
 
-    def unreached_services(self) -> dict[ServiceName, int]:
-        """Return the services for which no offering peer is reached, each with the number of those peers."""
-        return self._offers.unreached
-
     def recheck_peers(self, judged: Iterable[Peer], now: float) -> list[NodeName]:
         """End the sessions of peers that are bad now; return the refused ones taken, as they are `judged` good."""
         gone, taken = self.peers.recheck(), self.peers.readmit(judged)
-        self._commands.append((None, SetPeers(self.peers.for_links())))
-        self._follow_offers(now)
+        self._tell_links_of_peers()
+        self._role.on_peers_changed(now)
         for name in gone:
             self._forget_session(name, now)
         self._follow_gone(gone, now)
@@ -325,47 +221,28 @@ class Engine:
 
     def apply_mapping(self, mapping: MappingSet) -> str | None:
         """Take a mapping; return why it is refused, or None."""
-        error = self.mapping.apply(mapping, self._interfaces, self.peers.names())
+        error = self._role.apply_mapping(mapping, self._interfaces)
         if error:
             self.stats.nacks += 1
-            return error
-        self.stats.mapping_version = self.mapping.version
-        if self._config.role is Role.ROBOT:
-            self._remember_types(mapping)
-        return None
-
-    def _remember_types(self, mapping: MappingSet) -> None:
-        """Remember each mapped service's type, which its mapped servers offer. After a restart that is all we know, and
-        a server that offers another type must not win by coming first."""
-        for service in mapping.services:
-            if self._offers.knows_type(service.service):
-                continue
-            peers = [self.peers.get(server) for server in {assignment.server for assignment in service.assignments}]
-            kinds = {offer.type for peer in peers if peer for offer in peer.offers if offer.name == service.service}
-            if len(kinds) == 1:
-                self._offers.remember_type(service.service, kinds.pop())
-
-    @property
-    def offer_conflicts(self) -> frozenset[tuple[ServiceName, NodeName, str]]:
-        """Robot: return the servers left out as (service, server, type): the configuration or the others differ."""
-        return frozenset(self._offers.conflicts)
-
-    def take_urgency(self) -> ReportScope | None:
-        """Robot: return what to report before the next report, since a path changed or a deadline was missed."""
-        return self._measurements.take_urgency() if self._config.role is Role.ROBOT else None
-
-    def take_report(self, now: float, scope: ReportScope = ReportScope.ALL) -> Report:
-        """Return what was measured since the last report."""
-        if scope is ReportScope.CHANGES:
-            measured = self._measurements.take_changes(self.routes)
-        else:
-            measured = self._measurements.take(self.routes, self.peers.names())
-        return replace(measured, penalties=self._penalties.report(now), goodbyes=self._goodbyes.report())
+        return error
 
     @property
     def service_mappings(self) -> tuple[ServiceMapping, ...]:
         """Return the mapping in force."""
-        return tuple(self.mapping.services.values())
+        return self._role.service_mappings
+
+    @property
+    def offer_conflicts(self) -> frozenset[tuple[ServiceName, NodeName, str]]:
+        """Return the servers left out as (service, server, type): the configuration or the others differ."""
+        return self._role.offer_conflicts
+
+    def take_urgency(self) -> ReportScope | None:
+        """Return what to report before the next report is due."""
+        return self._role.take_urgency()
+
+    def take_report(self, now: float, scope: ReportScope = ReportScope.ALL) -> Report:
+        """Return what was measured since the last report."""
+        return self._role.take_report(now, scope)
 
     # -- the links' events ----------------------------------------------------------------------------------------
 
@@ -373,7 +250,9 @@ class Engine:
         """Take an event of a link."""
         match event:
             case FragmentsReceived(path, session, fragments):
-                if self._is_current(path, session):
+                if self.peers.session(path.peer) != session:
+                    self.stats.dropped["fragment_of_old_session"] += 1
+                else:
                     for content, ends_at in self._inbound.add(path, session, fragments, now):
                         self._on_message(path, content, ends_at, now)
             case MessageAbandoned(peer, session, number):
@@ -387,12 +266,12 @@ class Engine:
                 self._inbound.on_finished_lost(path.peer, numbers, self.routes.best_to(path.peer))
             case FragmentsLost():
                 if event.timed_out and (message := self._outbox.under_way(event.message)) is not None:
-                    self._requests.on_copy_lost(message, now)
+                    self._role.on_copy_lost(message, now)
                 self._outbox.on_lost(event, now)
             case PathMeasured() if self._knows(event.path):
                 self.routes.set_rtt(event.path, event.smoothed_rtt_s)
                 self.routes.note_fates(event.path, event.arrived, event.missed, policed=event.policed)
-                self._measurements.path(event)
+                self._role.on_path_measured(event)
             case PathChanged():
                 self._on_path_changed(event, now)
             case PathMtuChanged(path, max_datagram) if self._knows(path):
@@ -403,15 +282,13 @@ class Engine:
                 if self.peers.restarted(event, now):
                     self._forget_session(event.peer, now)
                     self._follow_gone((event.peer,), now)
-                    self._commands.append((None, SetPeers(self.peers.for_links())))
+                    self._tell_links_of_peers()
             case PeerRenewed():
                 if self.peers.renewed(event, now):
-                    self._commands.append((None, SetPeers(self.peers.for_links())))
+                    self._tell_links_of_peers()
             case PeerClosed(peer, session):
                 if self.peers.session(peer) == session:
-                    if self._config.role is Role.ROBOT:
-                        self._goodbyes.note(peer, session)
-                    self._on_peer_closed(peer, now)
+                    self._on_peer_closed(peer, session, now)
             case PeerLied(peer, session):
                 if self.peers.session(peer) == session:
                     self.peers.condemn(session)
@@ -430,24 +307,10 @@ class Engine:
         self._inbound.forgo_decoding(decoding)
 
     def _after_news(self, now: float) -> None:
+        """Send what waits for room if less is under way than before."""
         if self._outbox.take_made_room():
-            self._use_room(now)
-        self._count_in_flight()
-
-    def _count_in_flight(self) -> None:
-        self.stats.in_flight = self._requests.unanswered + self._serving.running
-
-    def _use_room(self, now: float) -> None:
-        """Send what waits for room, since less is under way than before."""
-        self._requests.on_room(now)
-        self._serving.on_room(now)
-        self.revocations.on_room(now)
-
-    def _is_current(self, path: PathId, session: SessionId) -> bool:
-        if self.peers.session(path.peer) == session:
-            return True
-        self.stats.dropped["fragment_of_old_session"] += 1
-        return False
+            self._role.on_room(now)
+            self.revocations.on_room(now)
 
     def _on_message(self, path: PathId, content: memoryview, ends_at: float, now: float) -> None:
         try:
@@ -458,25 +321,10 @@ class Engine:
         except DecodeError:
             self.stats.dropped["malformed_message"] += 1
             return
-        robot = self._config.role is Role.ROBOT
-        if isinstance(message, RevocationsHeld | RevocationsWanted | RevocationLists):
+        if isinstance(message, RevocationMessage):
             self.revocations.on_message(path.peer, message, now)
-        elif isinstance(message, RequestMessage):
-            if robot:
-                self.stats.dropped["request_to_a_robot"] += 1
-            else:
-                self._serving.on_request(path, message.when_left(ends_at - now), now)
-        elif isinstance(message, CancelMessage):
-            if robot:
-                self.stats.dropped["cancel_to_a_robot"] += 1
-            else:
-                self._serving.on_cancel(path.peer, message, now)
-        elif not robot:
-            self.stats.dropped["response_to_a_cloud"] += 1
-        elif isinstance(message, ResponseMessage):
-            self._requests.on_response(path.peer, message, now)
         else:
-            self._requests.on_rejection(path.peer, message, now)
+            self._role.on_message(path, message, ends_at, now)
 
     def _on_path_changed(self, event: PathChanged, now: float) -> None:
         path, state = event.path, event.state
@@ -484,20 +332,16 @@ class Engine:
             return
         reached = self.routes.reaches(path.peer)
         self.routes.set_state(path, state)
-        self._measurements.note_path_change(path)
         if state is PathState.UP:
-            self._goodbyes.is_back(path.peer)
             self._backlog.add_steps(self._outbox.on_path_up(path), now)
             self._inbound.on_path_up(path)
-            if self._requests.unanswered:  # the other paths may be back as well, and share what waits
-                self._seek(frozenset((path.peer,)))
         elif state is PathState.DOWN and not self.routes.reaches(path.peer):
             self._drop_unlisted((path.peer,), now)
         if self.routes.reaches(path.peer) is not reached:
-            self._update_offers(now)
+            self._role.on_reach_changed(now)
             if not reached:
                 self.revocations.on_reached(path.peer, now)
-        self._requests.on_path_changed(path, state, now)
+        self._role.on_path_changed(path, state, now)
 
     def _knows(self, path: PathId) -> bool:
         return path.peer in self.peers and path.interface in self._interfaces
@@ -511,83 +355,45 @@ class Engine:
                 dropped[name] = session
         if not dropped:
             return
-        self._follow_offers(now)
+        self._role.on_peers_changed(now)
         for name, session in dropped.items():
             self._forget_session(name, now, may_return=session)
         self._follow_gone(dropped, now)
-        self._commands.append((None, SetPeers(self.peers.for_links())))
+        self._tell_links_of_peers()
 
-    def _on_peer_closed(self, name: NodeName, now: float) -> None:
+    def _on_peer_closed(self, name: NodeName, session: SessionId, now: float) -> None:
         """Send nothing new to a peer that said goodbye; the control plane will remove it as well."""
         for route in self.routes.all_to(name):
             self.routes.set_state(route.id, PathState.DOWN)
-        self._backlog.add_steps(
-            [
-                *self._outbox.drop_peer(name),
-                *self._serving.on_session_over(name),
-                *self._serving.on_robot_gone(name),
-            ],
-            now,
-        )
-        self._update_offers(now)
-        self._requests.on_peer_gone(name, now)
+        self._role.on_closed(name, session, now)
+        self._follow_gone((name,), now)
         self._drop_unlisted((name,), now)
 
     def _forget_session(self, name: NodeName, now: float, *, may_return: SessionId | None = None) -> None:
-        """End a peer's session; with `may_return` it only fell silent, and may come back with it for its answers."""
-        if may_return is not None and self._config.role is Role.CLOUD:
-            self._away[name] = may_return
-            if len(self._away) > MAX_PEERS:
-                self._forget_session(next(iter(self._away)), now)
-        else:
-            self._away.pop(name, None)
-            called_off = self._serving.on_session_over(name)
-            let_go = [*self._outbox.drop_peer(name), *self._serving.on_robot_gone(name)]
-            self._backlog.add_steps(called_off + let_go, now)
+        """End a peer's session; with `may_return` it only fell silent, and may come back with it."""
+        self._role.on_session_over(name, now, may_return)
         self._inbound.forget_peer(name)
         self.revocations.forget_peer(name)
         self.routes.forget_peer(name)
 
     def _follow_gone(self, names: Collection[NodeName], now: float) -> None:
         if names:
-            self._update_offers(now)
+            self._role.on_reach_changed(now)
         for name in names:
-            self._requests.on_peer_gone(name, now)
-
-    def _update_offers(self, now: float) -> None:
-        if self._config.role is Role.ROBOT:
-            for event in self._offers.update(self.routes, now):
-                steps: list[Step] = []
-                if isinstance(event, WithdrawService):
-                    steps += self._requests.withdraw(event.name, event.reason)
-                steps.append(partial(self._tell, event))  # requests that wait at a service end before the service does
-                self._backlog.add(steps.copy, now)
-            gained = self._offers.take_gained()
-            if gained:
-                self._requests.on_servers_gained(gained, now)
-
-    def _tell(self, event: OfferService | WithdrawService, _now: float) -> None:
-        self._events.append(event)
-        self._services_changed = True  # a service in use is carried and offered
+            self._role.on_peer_gone(name, now)
 
     # -- time -----------------------------------------------------------------------------------------------------
 
     def next_timer(self) -> float:
         """Return when to call `handle_timer` next."""
-        timers = (
-            self._backlog.next_timer(),
-            self._requests.next_timer(),
-            self._serving.next_timer(),
-            self._offers.next_timer(),
-        )
+        timers = (self._backlog.next_timer(), self._role.next_timer())
         return min((self._sweep_at, self.revocations.next_timer(), *(timer for timer in timers if timer is not None)))
 
     def handle_timer(self, now: float) -> None:
         """Do what is due now, as much of it as one turn has room for."""
         self._backlog.begin_turn(now)
         self._backlog.run(now, leave=SLICE // 2)  # deadlines must not wait until all is done
-        self._requests.handle_timer(now)
-        self._serving.handle_timer(now)
+        self._role.handle_timer(now)
         self.revocations.handle_timer(now)
         self._backlog.run(now)
         if now >= self._sweep_at:
@@ -595,12 +401,4 @@ class Engine:
             self._backlog.add_steps(self._outbox.expired(now), now)
             self._outbox.ask_again()
             self._inbound.expire(now)
-        dark_until = self._offers.next_timer()
-        if dark_until is not None and dark_until <= now:
-            self._update_offers(now)
-        if self._outbox.take_made_room():
-            self._use_room(now)
-        self._count_in_flight()
-
-
-_REST: tuple[Step, ...] = (rest,) * 5
+        self._after_news(now)

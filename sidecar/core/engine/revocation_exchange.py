@@ -262,7 +262,7 @@ class RevocationExchange:
 
     def _send(self, peer: NodeName, content: Encoded, now: float) -> OutboundMessage | None:
         path = self._routes.best_to(peer)
-        if path is None:
+        if path is None or not self._outbox.admits(peer, content.size):
             return None  # when there is one, the peer is told and asked again
         ends_at = now + LIFETIME_S
         return self._outbox.send(path, content, priority=Priority.LOW, deadline=ends_at, expires=ends_at)

@@ -142,7 +142,7 @@ class DatagramBuilder:
             self._add_control(path, path.take_control(now), burst, now)
         if probing and path.probe_at <= now:
             self._add_probe(path, burst, now)
-        if probing and path.mtu_probe_at is not None and path.mtu_probe_at <= now:
+        if probing and (mtu_probe_at := path.mtu_probe_at) is not None and mtu_probe_at <= now:
             self._add_mtu_probe(path, burst, now)
         if path.pings:
             self._add_pings(path, burst, now)
@@ -153,21 +153,26 @@ class DatagramBuilder:
 
     def _add_fragments(self, path: Path, burst: Burst, now: float) -> bool:
         queue = path.queue
-        if not len(queue) or path.state is PathState.DOWN or path.remote is None:
+        remote = path.remote
+        if not len(queue) or path.state is PathState.DOWN or remote is None:
             return True
-        recovery, control = path.recovery, path.control
+        recovery, control, address = path.recovery, path.control, path.address
         expired_before = queue.expired
         complete = True
         budget = control.budget(now, recovery.in_flight)
         while budget > 0:
+            if not len(queue):
+                control.ran_dry()
+                break
             if burst.full:
                 complete = False
                 break
-            if path.address.allowance is not None and path.control_at < NEVER:
-                self._add_control(path, path.take_control(now), burst, now)
-            allowance = path.address.allowance
+            allowance = address.allowance
             if allowance is not None:
-                budget = min(budget, allowance)
+                if path.control_at < NEVER:
+                    self._add_control(path, path.take_control(now), burst, now)
+                    allowance = address.allowance
+                budget = budget if allowance is None else min(budget, allowance)
             run = queue.take(now, budget, control.pacing_rate or 0.0, recovery.rtt.smoothed)
             if run is None:
                 control.ran_dry()
@@ -175,10 +180,10 @@ class DatagramBuilder:
             if allowance is not None and run.symbols * run.message.datagram_bytes > allowance:
                 # Wait until the peer has proven to be there, or sent more from there.
                 queue.resend(run.message, range(run.first, run.first + run.symbols))
-                path.address.block()
+                address.block()
                 control.ran_dry()
                 break
-            sent = self._add_run(path, path.remote, run, burst, now)
+            sent = self._add_run(path, remote, run, burst, now)
             control.on_sent(now, sent, recovery.in_flight)
             budget -= sent
         if queue.expired != expired_before:

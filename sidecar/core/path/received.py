@@ -17,14 +17,15 @@ STALE_PACKETS = 1024
 class ReceivedPackets:
     """The packet numbers that came, as at most MAX_ACK_RANGES inclusive ranges, highest first."""
 
-    __slots__ = ("_ack_at", "_floor", "_gap", "_largest_at", "_ranges", "_unacked")
+    __slots__ = ("_floor", "_gap", "_largest_at", "_ranges", "_unacked", "ack_at")
 
     def __init__(self) -> None:
         self._ranges: list[list[int]] = []
         self._floor = -1
         """Everything up to here counts as received: it may have been, but its range is forgotten."""
         self._largest_at = 0.0
-        self._ack_at: float | None = None
+        self.ack_at: float | None = None
+        """When the acknowledgement is due; None when nothing is owed."""
         self._unacked = 0
         self._gap = False
 
@@ -87,18 +88,13 @@ class ReceivedPackets:
         """Owe an acknowledgement of ack-eliciting datagrams: now after a gap or ACK_EVERY of them, else soon."""
         self._unacked += count
         if self._unacked >= ACK_EVERY or self._gap:
-            self._ack_at = now
-        elif self._ack_at is None:
-            self._ack_at = now + MAX_ACK_DELAY_S
-
-    @property
-    def ack_at(self) -> float | None:
-        """When the acknowledgement is due; None when nothing is owed."""
-        return self._ack_at
+            self.ack_at = now
+        elif self.ack_at is None:
+            self.ack_at = now + MAX_ACK_DELAY_S
 
     def take_ack(self, now: float) -> tuple[list[tuple[int, int]], float]:
         """Return the ranges and the delay since the largest came, and clear what is owed."""
-        self._ack_at = None
+        self.ack_at = None
         self._unacked = 0
         self._gap = False
         return [(low, high) for low, high in self._ranges], max(0.0, now - self._largest_at)

@@ -78,6 +78,11 @@ class Turn:
         self.next = end
         return (first, end - first) if end > first else None
 
+    @property
+    def has_left(self) -> bool:
+        """Whether each of its symbols that were queued has left."""
+        return not self.again and self.next >= len(self.message)
+
     def remaining(self) -> tuple[int, ...]:
         """Return the symbols that have not left and still have to."""
         return tuple(filter(self.message.needs, (*self.again, *range(self.next, self._end))))
@@ -145,7 +150,7 @@ _Entry: TypeAlias = "tuple[float, int, Turn]"
 class _Class:
     """Messages of one priority by their prospects. Each heap goes after those named before it."""
 
-    __slots__ = ("covered", "fresh", "hopeless", "newest", "passed_over", "stale", "useless")
+    __slots__ = ("covered", "fresh", "heaps", "hopeless", "newest", "passed_over", "stale", "useless")
 
     def __init__(self) -> None:
         self.fresh: list[_Entry] = []
@@ -160,11 +165,9 @@ class _Class:
         """Expire sooner than they can be answered, unless the pace rises; by expiry, latest first."""
         self.covered: list[_Entry] = []
         """Left to another path; sorted by when to look at them again."""
+        self.heaps = (self.fresh, self.hopeless, self.stale, self.useless, self.covered)
         self.passed_over = 0
         """Symbols of higher priorities that left while something waited here."""
-
-    def heaps(self) -> tuple[list[_Entry], ...]:
-        return self.fresh, self.hopeless, self.stale, self.useless, self.covered
 
     def look_for_newest(self, now: float) -> None:
         """Rebuild `newest` from `hopeless`."""
@@ -209,14 +212,14 @@ class SendQueue:
             self._purge()
         self._entries[message.number] = entry
         mine = self._classes[message.priority]
-        if not any(mine.heaps()):
+        if not any(mine.heaps):
             mine.passed_over = 0
         heapq.heappush(mine.fresh, (message.deadline, next(self._order), entry))
 
     def _purge(self) -> None:
         """Drop messages that are over but have not come up yet, so that they hold no memory."""
         for each in self._classes:
-            for heap in each.heaps():
+            for heap in each.heaps:
                 heap[:] = [item for item in heap if not item[2].message.over]
                 heapq.heapify(heap)
             each.newest[:] = [item for item in each.newest if not item[2].message.over]
@@ -230,7 +233,9 @@ class SendQueue:
         Messages that are over or expired are dropped on the way. `pace` (bytes a second, 0 when unknown) and
         `round_trip_s` tell which can still make their deadline.
         """
-        waiting = [each for each in self._classes if self._head(each, now, pace, round_trip_s) is not None]
+        waiting = [
+            each for each in self._classes if any(each.heaps) and self._head(each, now, pace, round_trip_s) is not None
+        ]
         while waiting:
             chosen, most = waiting[0], MAX_RUN
             for lower in reversed(waiting[1:]):
@@ -262,7 +267,9 @@ class SendQueue:
             run = entry.take(max(1, min(most, budget // size, MAX_RUN_BYTES // size)))
             if run is not None:
                 entry.goes_on(now, pace, round_trip_s)
-                if heap is not chosen.fresh and heap is not chosen.covered:
+                if entry.has_left:
+                    self._drop(heap)
+                elif heap is not chosen.fresh and heap is not chosen.covered:
                     heapq.heapreplace(heap, (BEGUN, heap[0][1], entry))
                 return Run(message, *run)
             self._drop(heap)
@@ -270,12 +277,13 @@ class SendQueue:
 
     def _head(self, each: _Class, now: float, pace: float, round_trip_s: float) -> list[_Entry] | None:
         """Return the heap whose head goes next; drop heads that are over, and move those that belong elsewhere."""
-        self._hope_again(each, now, pace, round_trip_s)
+        if each.newest:
+            self._hope_again(each, now, pace, round_trip_s)
         covered = each.covered
         while covered and covered[0][2].covered_until(now, pace, round_trip_s) is None:
             _, order, entry = heapq.heappop(covered)
             heapq.heappush(each.fresh, (entry.message.deadline, order, entry))
-        for heap in each.heaps():
+        for heap in each.heaps:
             while heap:
                 _, order, entry = heap[0]
                 message = entry.message
@@ -343,7 +351,7 @@ class SendQueue:
         for entry in self._entries.values():
             entry.waits()
         for each in self._classes:
-            for heap in each.heaps():
+            for heap in each.heaps:
                 heap.clear()
             each.newest.clear()
         self._entries.clear()

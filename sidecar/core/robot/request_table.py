@@ -22,13 +22,20 @@ from plr.protos.model.mapping import Assignment
 from plr.sidecar.core.base.slices import GROUP, rest
 from plr.sidecar.core.base.timers import first_of
 from plr.sidecar.core.base.values import PathId, PathState, RejectReason, RequestId
+from plr.sidecar.core.robot.dispatch.attention import Attention
 from plr.sidecar.core.robot.dispatch.backlog import NoRoom
 from plr.sidecar.core.robot.dispatch.cancelling import SMALL_ANSWER_BYTES, CallingOff
 from plr.sidecar.core.robot.dispatch.dispatcher import MAX_COPIES, Dispatching
 from plr.sidecar.core.robot.measure.outcomes import measure_outcomes
 from plr.sidecar.core.robot.request.request import Answer, Copy, CopyState, Request
 from plr.sidecar.core.seam.application import DeadlineMissed, RequestFailed, ResponseArrived, Unreachable
-from plr.sidecar.core.wire.messages import MAX_NAME_BYTES, MAX_PAYLOAD_BYTES, RejectionMessage, ResponseMessage
+from plr.sidecar.core.wire.messages import (
+    MAX_NAME_BYTES,
+    MAX_PAYLOAD_BYTES,
+    RejectionMessage,
+    ResponseMessage,
+    request_bytes,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Iterable, Iterator
@@ -37,7 +44,7 @@ if TYPE_CHECKING:
     from plr.sidecar.core.base.slices import Step
     from plr.sidecar.core.message.outbound import OutboundMessage
     from plr.sidecar.core.robot.dispatch.context import RequestParts
-    from plr.sidecar.core.rules.service_rule import ServiceRule
+    from plr.sidecar.core.robot.request.service_catalog import Offered
 
 MAX_IN_FLIGHT = 8192
 """Most requests that wait for a response."""
@@ -62,6 +69,7 @@ class RequestTable:
         self._backlog = parts.backlog
         self._timers: list[tuple[float, RequestId]] = []
         self._most_timers = TIMER_SLACK
+        self._attention = Attention(parts.command)
         self._calling_off = CallingOff(parts.routes, parts.outbox, parts.stats)
         self._dispatching = Dispatching(parts)
         self._no_room = NoRoom(self._dispatching, parts.routes)
@@ -70,38 +78,52 @@ class RequestTable:
 
     # -- the application ------------------------------------------------------------------------------------------
 
-    def submit(
-        self,
-        request_id: RequestId,
-        service: ServiceName,
-        kind: str,
-        rule: ServiceRule,
-        payload: bytes,
-        now: float,
-    ) -> None:
+    def submit(self, request_id: RequestId, service: ServiceName, payload: bytes, now: float) -> None:
         """Send a request. It ends in exactly one RequestFailed, or with an answer judged good."""
+        offered = self._parts.offers.find(service)
+        problem = self._problem(request_id, service, offered, len(payload))
+        if offered is None or problem:
+            self._count_outcome(service, "rejected")
+            self._parts.emit(RequestFailed(request_id, service, "rejected", problem, 0.0))
+            return
+        kind, rule, servers = offered
+        self._attention.ask_for(servers, now)
         size_class = self._parts.measurements.size_class(service, len(payload))
         request = Request(request_id, service, kind, rule, payload, now, size_class)
-        problem = self._problem(request)
-        if problem:
-            self.reject(request_id, service, problem)
-            return
-        request.size = self._dispatching.encode(request, payload, now).size
+        request.size = request_bytes(service, kind, len(payload))
         self._requests.add(request)
-        self.unanswered += 1
+        self._count_unanswered(1)
         self._held_bytes += request.held
         self._arm(request.deadline_at, request_id)
-        request.dark = self._parts.routes.dark(self._parts.offers.servers(service))
-        self._dispatch(request, now)
-        if request in self._no_room:
+        request.dark = self._parts.routes.dark(servers)
+        if self._start(request, self._no_room.open_to(request, servers), now):
             self.on_room(now)  # it may be more urgent than those that wait, or small enough
         self._notice_unreachable(request, now)
 
-    def reject(self, request_id: RequestId, service: ServiceName, why: str) -> None:
-        """Refuse a request of the application."""
-        self._parts.stats.requests[service, "rejected"] += 1
-        self._parts.measurements.outcome(service, "rejected")
-        self._parts.emit(RequestFailed(request_id, service, "rejected", why, 0.0))
+    def _problem(self, request_id: RequestId, service: ServiceName, offered: Offered | None, size: int) -> str:
+        """Return why a request is rejected; an empty string if it is not."""
+        if offered is None:
+            return "no server offers this service any more"
+        if size > MAX_PAYLOAD_BYTES:
+            return f"the request has {size} bytes, the limit is {MAX_PAYLOAD_BYTES}"
+        if len(service.encode()) > MAX_NAME_BYTES or len(offered.type.encode()) > MAX_NAME_BYTES:
+            return f"the service's name or type is longer than {MAX_NAME_BYTES} bytes"
+        if self.unanswered >= MAX_IN_FLIGHT:
+            return f"{MAX_IN_FLIGHT} requests are in flight already"
+        if self._held_bytes + size > MAX_HELD_BYTES:
+            return f"the requests in flight have {self._held_bytes} bytes already"
+        if request_id in self._requests:
+            return "a request with this identity is in flight already"
+        return ""
+
+    def _count_outcome(self, service: ServiceName, outcome: str) -> None:
+        """Count how a request ended: for the metrics, and for the control plane."""
+        self._parts.stats.requests[service, outcome] += 1
+        self._parts.measurements.outcome(service, outcome)
+
+    def _count_unanswered(self, more: int) -> None:
+        self.unanswered += more
+        self._parts.stats.in_flight = self.unanswered
 
     def answered_here(self, request_id: RequestId, now: float) -> None:
         """Note that the application got its answer on the robot. The request ends at its deadline at the latest."""
@@ -111,28 +133,10 @@ class RequestTable:
             if now >= request.deadline_at:
                 self._end_answered_here(request, now)
 
-    def _problem(self, request: Request) -> str | None:
-        size = len(request.payload or b"")
-        if size > MAX_PAYLOAD_BYTES:
-            return f"the request has {size} bytes, the limit is {MAX_PAYLOAD_BYTES}"
-        if len(request.service.encode()) > MAX_NAME_BYTES or len(request.type.encode()) > MAX_NAME_BYTES:
-            return f"the service's name or type is longer than {MAX_NAME_BYTES} bytes"
-        if self.unanswered >= MAX_IN_FLIGHT:
-            return f"{MAX_IN_FLIGHT} requests are in flight already"
-        if self._held_bytes + size > MAX_HELD_BYTES:
-            return f"the requests in flight have {self._held_bytes} bytes already"
-        if request.id in self._requests:
-            return "a request with this identity is in flight already"
-        return None
-
-    def _dispatch(self, request: Request, now: float) -> None:
-        """Send a request without copies, unless others wait for the same room."""
-        if request not in self._no_room:
-            self._start(request, self._no_room.open_to(request), now)
-
-    def _start(self, request: Request, servers: list[NodeName], now: float) -> None:
+    def _start(self, request: Request, servers: list[NodeName], now: float) -> bool:
+        """Send a request without copies to some of these servers; return whether it waits for room now."""
         self._look_at(request, self._dispatching.start(request, servers, now))
-        self._no_room.consider(request)
+        return not request.copies and self._no_room.consider(request)
 
     def on_room(self, now: float) -> None:
         """Send the requests that found no room, each in its turn, since less waits to be sent than before."""
@@ -233,7 +237,11 @@ class RequestTable:
         )
 
     def _call_off_losers(self, request: Request, winner: Copy, answer: Answer, now: float) -> None:
-        losers = [copy for copy in request.pending() if copy.hedges or not request.observed]
+        losers = (
+            [copy for copy in request.pending() if copy.hedges or not request.observed]
+            if len(request.copies) > 1
+            else []
+        )
         if losers:
             small = answer.size <= SMALL_ANSWER_BYTES
             self._calling_off.call_off(request, losers, now, untold=winner.path.peer if small else None)
@@ -262,7 +270,10 @@ class RequestTable:
         """Finish a request that was answered at this time."""
         elapsed = at - request.submitted_at
         self._finish(request, "deadline_missed" if elapsed > request.rule.deadline_s else "ok")
-        self._parts.stats.durations.setdefault(request.service, Histogram()).record(elapsed)
+        durations = self._parts.stats.durations.get(request.service)
+        if durations is None:
+            durations = self._parts.stats.durations[request.service] = Histogram()
+        durations.record(elapsed)
 
     def _answer_is_bad(self, request: Request, copy: Copy, problem: str, now: float) -> None:
         """Fail the copy as if its server had not answered, and ask others, which replace that server for a while."""
@@ -436,8 +447,8 @@ class RequestTable:
         """Send a request that had no path, or whose copies are all in trouble, as there is one more way to a server."""
         if request.copies:
             self._rescue(request, now)
-        else:
-            self._dispatch(request, now)
+        elif request not in self._no_room:
+            self._start(request, self._no_room.open_to(request, self._dispatching.candidates(request)), now)
 
     def _notice_unreachable(self, request: Request, _now: float) -> None:
         if request.rule.fallback is None or request.found_unreachable or request.done:
@@ -539,9 +550,8 @@ class RequestTable:
         request.done = True
         self._no_room.remove(request)
         request.payload = None
-        self.unanswered -= 1
-        self._parts.stats.requests[request.service, outcome] += 1
-        self._parts.measurements.outcome(request.service, outcome)
+        self._count_unanswered(-1)
+        self._count_outcome(request.service, outcome)
 
     def _settle(self, request: Request, now: float) -> None:
         """Forget a request whose copies have all come to an end."""
@@ -552,8 +562,7 @@ class RequestTable:
                     self._parts.measurements.called_off(request.carried(copy), now - copy.sent_at)
             self._calling_off.call_off(request, undelivered, now)
         if request.done and not request.pending():
-            if request.id in self._requests:
-                self._requests.remove(request)
+            if self._requests.remove(request):
                 self._held_bytes -= request.held
             request.messages.clear()
             self._measure(request, now)

@@ -1,1 +1,1 @@
-"""Keeps undelivered messages, across all paths. Imports `base`, `wire`, `message` and `seam`."""
+"""Keeps undelivered messages, across all paths. Imports `base`, `wire`, `message`, `seam` and `rules`."""

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from plr.protos.model.ids import InterfaceName, NodeName
     from plr.sidecar.core.base.slices import Step
     from plr.sidecar.core.base.values import PathId, Priority, RequestId
-    from plr.sidecar.core.message.repair import Redundancy
+    from plr.sidecar.core.message.repair import Loss, Redundancy
     from plr.sidecar.core.seam.links import PathCommand
     from plr.sidecar.core.seam.stats import EngineStats
     from plr.sidecar.core.transfer.routes import Routes
@@ -76,6 +76,13 @@ class Outbox:
         """Return whether another message of this size may be sent to this peer."""
         return self._room.fits(peer, size)
 
+    def admits(self, peer: NodeName, size: int) -> bool:
+        """Return whether another message of this size may be sent to this peer; count it as left out if not."""
+        fits = self._room.fits(peer, size)
+        if not fits:
+            self._stats.dropped["outbox_full"] += 1
+        return fits
+
     def take_made_room(self) -> bool:
         """Return whether a message ended since the last call, so that what waits for room may find it."""
         made, self._made_room = self._made_room, False
@@ -106,21 +113,19 @@ class Outbox:
         answers: RequestId | None = None,
         copy_of: RequestId | None = None,
         siblings: list[MessageSymbols] | None = None,
-    ) -> OutboundMessage | None:
-        """Send a message over `path`; return None (counted) if there is no room.
+    ) -> OutboundMessage:
+        """Send a message over `path`, to a peer that has room for it: `has_room` and `admits` say which.
 
         `fec`: repair symbols for each source symbol, None: by the path's loss; none at all if they find no room.
         `answers`: the request that it answers, by which `drop_answers` finds it.
         `copy_of`: the request that it is a copy of.
         `siblings`: the messages that already carry the same request; it joins them.
         """
-        if not self.has_room(path.peer, content.size):
-            self._stats.dropped["outbox_full"] += 1
-            return None
+        size, loss = content.size, self._routes.loss(path)
         symbol = self._routes.symbol_to(path.peer)
-        count = symbol_count(content.size, symbol)
-        repairs = repair_symbols(count, fec, self._routes.loss(path))
-        if repairs and not self._room.fits(path.peer, content.size, (count + repairs) * symbol):
+        count = symbol_count(size, symbol)
+        repairs = repair_symbols(count, fec, loss)
+        if repairs and not self._room.fits(path.peer, size, (count + repairs) * symbol):
             repairs = 0
         symbols = MessageSymbols(
             self._take_number(),
@@ -133,7 +138,7 @@ class Outbox:
             siblings=siblings,
         )
         message = OutboundMessage(path, symbols, answers=answers, copy_of=copy_of)
-        self._enter(message)
+        self._enter(message, loss)
         return message
 
     def _take_number(self) -> int:
@@ -141,21 +146,22 @@ class Outbox:
         self._next_number += 1
         return number
 
-    def _enter(self, message: OutboundMessage) -> None:
-        self._messages[message.number] = message
-        self._by_peer.setdefault(message.peer, {})[message.number] = message
+    def _enter(self, message: OutboundMessage, loss: Loss) -> None:
+        peer, number = message.path.peer, message.number
+        self._messages[number] = message
+        self._by_peer.setdefault(peer, {})[number] = message
         if message.answers is not None:
-            self._answers.setdefault((message.peer, message.answers), []).append(message)
+            self._answers.setdefault((peer, message.answers), []).append(message)
         self._room.take(message)
         self._command(Send(message.path, message.symbols))
-        if not message.symbols.repairs and worth_a_copy(1, self._routes.loss(message.path)):
+        if not message.symbols.repairs and worth_a_copy(1, loss):
             # It leaves before the others, so a burst does not take both.
             self._send_copies(message, message.path, (message.symbols.count - 1,))
 
     def on_finished(self, peer: NodeName, number: int) -> OutboundMessage | None:
         """Remove a message that the peer holds; None if it is not one of the peer's messages, or was already over."""
         message = self._messages.get(number)
-        if message is None or message.peer != peer:
+        if message is None or message.path.peer != peer:
             return None
         self._remove(message)
         return message
@@ -188,15 +194,16 @@ class Outbox:
     def _remove(self, message: OutboundMessage) -> None:
         message.end()
         if self._messages.pop(message.number, None) is not None:
-            of_peer = self._by_peer.get(message.peer, {})
+            peer = message.path.peer
+            of_peer = self._by_peer.get(peer, {})
             of_peer.pop(message.number, None)
             if not of_peer:
-                self._by_peer.pop(message.peer, None)
+                self._by_peer.pop(peer, None)
             self._room.give_back(message)
             self._made_room = True
-            self._parked.get(message.peer, {}).pop(message.number, None)
+            self._parked.get(peer, {}).pop(message.number, None)
             if message.answers is not None:
-                self._forget_answer((message.peer, message.answers), message)
+                self._forget_answer((peer, message.answers), message)
 
     def drop_answers(self, peer: NodeName, request: RequestId) -> None:
         """Keep back what is unsent of the answers to this request, which the peer called off."""
@@ -262,7 +269,8 @@ class Outbox:
         self._enter_again(message, path)
 
     def _enter_again(self, message: OutboundMessage, path: PathId) -> None:
-        self._enter(message.cut_again(self._take_number(), path, self._routes.symbol_to(path.peer)))
+        again = message.cut_again(self._take_number(), path, self._routes.symbol_to(path.peer))
+        self._enter(again, self._routes.loss(path))
 
     def on_path_up(self, path: PathId) -> list[Step]:
         """Return the steps that send all that waited for a path to this peer."""

@@ -77,21 +77,21 @@ class Room:
 
     def take(self, message: OutboundMessage) -> None:
         """Take the room of a message under way; the caller asks `fits` before."""
-        self._messages.take(message.peer)
+        self._messages.take(message.path.peer)
         self._add(message, message.symbols.held_bytes)
 
     def give_back(self, message: OutboundMessage) -> None:
         """Give back the room of a message that is over."""
-        self._messages.give_back(message.peer)
+        self._messages.give_back(message.path.peer)
         self._add(message, -message.symbols.held_bytes)
 
     def _add(self, message: OutboundMessage, held: int) -> None:
         self.held_bytes += held
-        key = message.peer, Lane.of(message.symbols.total)
+        path = message.path
+        key = path.peer, Lane.of(message.symbols.total)
         self._held[key] = self._held.get(key, 0) + held
         if not self._held[key]:
             del self._held[key]
-        path = message.path
         self._over[path] = self._over.get(path, 0) + held
         if not self._over[path]:
             del self._over[path]

@@ -119,7 +119,8 @@ class RevocationLists:
 
 
 RevocationMessage = RevocationsHeld | RevocationsWanted | RevocationLists
-Message = RequestMessage | ResponseMessage | RejectionMessage | CancelMessage | RevocationMessage
+ServiceMessage = RequestMessage | ResponseMessage | RejectionMessage | CancelMessage
+Message = ServiceMessage | RevocationMessage
 
 
 class Encoded(NamedTuple):
@@ -162,6 +163,12 @@ def encode_message(message: Message) -> Encoded:
     text = message.text.encode(errors="replace")[:MAX_TEXT_BYTES]
     head = _HEAD.pack(_REJECTION, message.request_id, message.copy) + bytes((message.reason,)) + _U16.pack(len(text))
     return Encoded(head, text)
+
+
+def request_bytes(service: ServiceName, kind: str, payload_bytes: int) -> int:
+    """Return the length of the message that carries a request; all its copies are equally long."""
+    names = 2 * _U16.size + len(service.encode()) + len(kind.encode())
+    return _HEAD.size + _REQUEST_TIMES.size + names + payload_bytes
 
 
 def _encode_about_revocations(message: RevocationMessage) -> Encoded:

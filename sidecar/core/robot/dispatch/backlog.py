@@ -40,20 +40,25 @@ class NoRoom:
     def __contains__(self, request: Request) -> bool:
         return request.id in self._waiting
 
-    def open_to(self, request: Request) -> list[NodeName]:
-        """Return the servers that have room for the request and that no other request waits for."""
-        lane = Lane.of(request.size)
-        servers = self._dispatching.candidates(request)
-        return self._dispatching.with_room((each for each in servers if (lane, each) not in self._awaited), request)
+    def open_to(self, request: Request, servers: Iterable[NodeName]) -> list[NodeName]:
+        """Return those of the servers that have room for the request and that no other request waits for."""
+        if self._awaited:
+            lane = Lane.of(request.size)
+            servers = [each for each in servers if (lane, each) not in self._awaited]
+        return self._dispatching.with_room(servers, request)
 
-    def consider(self, request: Request, *, rejected: bool = False) -> None:
-        """Let a request wait if it could be sent now (or again) and lacks nothing but room."""
-        if request.id in self._waiting or request.answered_here or not request.may_be_sent():
-            return
+    def consider(self, request: Request, *, rejected: bool = False) -> bool:
+        """Let a request wait if it could be sent now (or again) and lacks nothing but room; return whether it waits."""
+        if request.id in self._waiting:
+            return True
+        if request.answered_here or not request.may_be_sent():
+            return False
         reached = self._reached(self._dispatching.candidates(request, rejected=rejected))
         lane = Lane.of(request.size)
         if reached and all((lane, each) in self._awaited for each in self._dispatching.with_room(reached, request)):
             self._add(request, (lane, reached))
+            return True
+        return False
 
     def _reached(self, servers: Iterable[NodeName]) -> tuple[NodeName, ...]:
         return tuple(server for server in servers if self._routes.reaches(server))

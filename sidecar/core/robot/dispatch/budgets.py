@@ -54,10 +54,8 @@ class Budgets:
         self._budgets = tuple(budgets)
         self._stats = stats
         self._purses: dict[InterfaceName, _Purse] = {}
-
-    def __bool__(self) -> bool:
-        """Return whether anything is limited."""
-        return any(one.limits for one in self._budgets)
+        self.limit = any(one.limits for one in self._budgets)
+        """Whether any of them limits anything."""
 
     def earn(self, size: int, interfaces: Iterable[InterfaceName]) -> None:
         """Credit every purse with a request of `size` bytes answered in time; its mapping names `interfaces`."""

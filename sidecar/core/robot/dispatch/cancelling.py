@@ -56,10 +56,11 @@ class CallingOff:
         servers -= {untold, *(copy.path.peer for copy in request.pending())}
         for server in servers:
             path = self._routes.best_to(server)
-            if path is not None:
+            cancel = encode_message(CancelMessage(request.id))
+            if path is not None and self._outbox.admits(server, cancel.size):
                 self._outbox.send(
                     path,
-                    encode_message(CancelMessage(request.id)),
+                    cancel,
                     priority=Priority.HIGH,
                     deadline=now + CANCEL_DEADLINE_S,
                     expires=request.expires_at,

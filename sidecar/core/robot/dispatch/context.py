@@ -12,12 +12,12 @@ from plr.sidecar.core.robot.request.index import RequestIndex
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from plr.protos.model.ids import NodeName
     from plr.sidecar.core.robot.measure.measurements import Measurements
     from plr.sidecar.core.robot.request.mapping_table import MappingTable
     from plr.sidecar.core.robot.request.service_catalog import Offers
     from plr.sidecar.core.rules.budget import Budget
     from plr.sidecar.core.seam.application import ApplicationEvent
+    from plr.sidecar.core.seam.links import LinkCommand
     from plr.sidecar.core.seam.stats import EngineStats
     from plr.sidecar.core.transfer.outbox import Outbox
     from plr.sidecar.core.transfer.routes import Routes
@@ -34,8 +34,7 @@ class RequestParts:
     measurements: Measurements
     stats: EngineStats
     emit: Callable[[ApplicationEvent], None]
-    seek: Callable[[frozenset[NodeName]], None]
-    """Ask the links to look for a path to any of these peers."""
+    command: Callable[[LinkCommand], None]
     budgets: tuple[Budget, ...] = ()
     """Limits on the cost of extra copies."""
     backlog: Backlog = field(default_factory=Backlog)

@@ -16,6 +16,7 @@ from plr.sidecar.core.robot.dispatch.exploration import Exploration
 from plr.sidecar.core.robot.dispatch.modes import MODES
 from plr.sidecar.core.robot.dispatch.pair_history import PathPaces, PathRecords
 from plr.sidecar.core.robot.request.request import Copy, CopyState, Request
+from plr.sidecar.core.seam.links import Seek
 from plr.sidecar.core.wire.messages import RequestMessage, encode_message
 
 if TYPE_CHECKING:
@@ -24,7 +25,6 @@ if TYPE_CHECKING:
     from plr.protos.model.ids import NodeName
     from plr.sidecar.core.base.values import PathId
     from plr.sidecar.core.robot.dispatch.context import RequestParts
-    from plr.sidecar.core.wire.messages import Encoded
 
 MAX_COPIES = 8
 """Most copies of one request, including those sent in trouble."""
@@ -70,20 +70,22 @@ class Dispatching:
         return request.worth_another_copy(servers, rejected=rejected)
 
     def start(self, request: Request, servers: Collection[NodeName], now: float) -> float | None:
-        """Send the first copies to some of these servers; return when to call `look_again`, if at all."""
+        """Send the first copies to some of these servers; return when to call `look_again`, if at all.
+
+        Each of the servers has room for one copy.
+        """
         rule = request.rule
         servers = self._favoured(servers, now)
         chosen = self._parts.mapping.choose(request.service, servers, idempotent=rule.idempotent)
         if MODES[rule.redundancy].at_once:
-            paths = self._best_first(request, chosen, now) if self._budgets else chosen
-            request.withheld = tuple(path for path in paths if not self._send(request, path, now, _Why.MAPPED))
+            self._send_all(request, self._best_first(request, chosen, now) if self._budgets.limit else chosen, now)
         else:
             self._send_best(request, self._best_first(request, chosen, now), now)
         if servers and not request.copies:
-            self._parts.seek(frozenset(servers))
+            self._parts.command(Seek(frozenset(servers)))
         look_at = self.first_look(request, now)
-        unmapped = self._exploration.path(request, servers, now)
-        if unmapped is not None:
+        unmapped = self._exploration.path(request, servers, now) if rule.exploration else None
+        if unmapped is not None and self._parts.outbox.admits(unmapped.peer, request.size):
             self._send(request, unmapped, now, _Why.EXPLORATION)
         request.choose_observation()
         return look_at
@@ -92,6 +94,18 @@ class Dispatching:
         """Return the servers within reach that are in favour; others only if there are none."""
         reached = [server for server in servers if self._parts.routes.reaches(server)]
         return self._parts.penalties.favoured(reached or servers, now)
+
+    def _send_all(self, request: Request, paths: Iterable[PathId], now: float) -> None:
+        served: set[NodeName] = set()
+        withheld = []
+        for path in paths:
+            # The first copy may have taken the room that its server had.
+            room = path.peer not in served or self._parts.outbox.admits(path.peer, request.size)
+            if room and self._send(request, path, now, _Why.MAPPED):
+                served.add(path.peer)
+            else:
+                withheld.append(path)
+        request.withheld = tuple(withheld)
 
     def _send_best(self, request: Request, paths: list[PathId], now: float) -> None:
         while paths and not request.copies:
@@ -111,7 +125,7 @@ class Dispatching:
 
     def first_look(self, request: Request, now: float) -> float | None:
         """Return when to call `look_again` for a request of which one copy was just sent, if at all."""
-        if not request.relied_on() or now >= request.deadline_at or not request.rule.redundancy.helps:
+        if now >= request.deadline_at or not request.relied_on():
             return None
         return MODES[request.rule.redundancy].first_look(self, request, now)
 
@@ -225,53 +239,50 @@ class Dispatching:
     def ended(self, request: Request, now: float) -> None:
         """Note the outcome of the copies, once for each request: all are known, or the deadline is over."""
         self.records.note(request, now)
-        if self._budgets and any(copy.in_time for copy in request.copies):
+        if self._budgets.limit and any(copy.in_time for copy in request.copies):
             paths = (*request.withheld, *(copy.path for copy in request.copies))
             self._budgets.earn(request.copies[0].message.symbols.total, {path.interface for path in paths})
 
-    def encode(self, request: Request, payload: bytes, now: float) -> Encoded:
-        """Return the next copy as a message; all copies are equally long."""
-        return encode_message(
+    def _send(self, request: Request, path: PathId, now: float, why: _Why) -> bool:
+        """Send a copy for which the path's server has room; return whether the budgets and MAX_COPIES allowed it."""
+        sent = len(request.copies)
+        if request.payload is None or (sent >= MAX_COPIES and sent >= _most_copies(request)):
+            return False
+        rule, stats = request.rule, self._parts.stats
+        extra = bool(request.copies and request.relied_on())
+        if extra and not self._budgets.allows(path.interface, request.service, request.size, now):
+            return False
+        deadline, expires = request.deadline_at, request.expires_at
+        content = encode_message(
             RequestMessage(
                 request.id,
                 len(request.copies),
-                request.rule.priority,
-                request.deadline_at - now,
-                request.expires_at - now,
+                rule.priority,
+                deadline - now,
+                expires - now,
                 request.service,
                 request.type,
-                payload,
+                request.payload,
             )
         )
-
-    def _send(self, request: Request, path: PathId, now: float, why: _Why) -> bool:
-        if request.payload is None or len(request.copies) >= _most_copies(request):
-            return False
-        rule, stats = request.rule, self._parts.stats
-        content = self.encode(request, request.payload, now)
-        extra = bool(request.relied_on())
-        if extra and not self._budgets.allows(path.interface, request.service, content.size, now):
-            return False
         message = self._parts.outbox.send(
             path,
             content,
             priority=rule.priority,
             fec=rule.fec,
-            deadline=request.deadline_at,
-            expires=request.expires_at,
+            deadline=deadline,
+            expires=expires,
             copy_of=request.id,
-            siblings=request.messages if why in _PLANNED and not request.is_race() else None,
+            siblings=request.messages if why in _PLANNED and not request.races else None,
         )
-        if message is None:
-            return False
         explores = why is _Why.EXPLORATION
         copy = Copy(path, now, message, explores=explores, hedges=why is _Why.HEDGE)
         request.copies.append(copy)
         self._parts.in_flight.add_copy(request, copy)
         request.withheld = tuple(other for other in request.withheld if other != path)
         if extra:
-            self._budgets.spend(path.interface, content.size)
-        stats.copy_bytes[path.interface, request.service, "extra" if extra else "first"] += content.size
+            self._budgets.spend(path.interface, request.size)
+        stats.copy_bytes[path.interface, request.service, "extra" if extra else "first"] += request.size
         if explores:
             stats.explored[path.interface, path.peer, request.service] += 1
         elif why is _Why.HEDGE:

@@ -125,4 +125,4 @@ class Exploration:
 
 def _may_explore(request: Request) -> bool:
     small = len(request.payload or b"") <= MAX_REQUEST_BYTES
-    return small and 0 < len(request.copies) <= MAX_MAPPED_COPIES and request.is_race()
+    return small and 0 < len(request.copies) <= MAX_MAPPED_COPIES and request.races

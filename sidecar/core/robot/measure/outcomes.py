@@ -24,18 +24,21 @@ from plr.sidecar.core.robot.measure.measurements import InterfacePair, PairOutco
 from plr.sidecar.core.robot.request.request import CopyState
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Iterable, Iterator
 
     from plr.protos.model.ids import InterfaceName, NodeName
     from plr.sidecar.core.robot.measure.measurements import Measurements
     from plr.sidecar.core.robot.request.request import Copy, Request
 
 
-def interface_outcomes(request: Request) -> Iterator[tuple[InterfacePair, PairOutcome]]:
-    """Yield the outcomes per pair of interfaces of a request whose deadline is over or whose copies have all ended."""
+def interface_outcomes(request: Request, copies: Iterable[Copy]) -> Iterator[tuple[InterfacePair, PairOutcome]]:
+    """Yield the outcomes per pair of interfaces of a request whose deadline is over or whose copies have all ended.
+
+    `copies` are those that started together.
+    """
     missed: dict[InterfaceName, bool] = {}
     servers: dict[InterfaceName, NodeName] = {}
-    for copy in request.started_together():
+    for copy in copies:
         if copy.state is CopyState.REJECTED:
             return
         if copy.path.interface not in missed:
@@ -45,7 +48,7 @@ def interface_outcomes(request: Request) -> Iterator[tuple[InterfacePair, PairOu
         for interface in request.dark:
             if interface not in missed:
                 missed[interface] = not any(copy.in_time for copy in request.copies if copy.path.interface == interface)
-    raced = request.is_race()
+    raced = request.races
     to_one = len(servers) > 1 and len(set(servers.values())) == 1
     if not raced and (len(missed) != 2 or to_one):
         return
@@ -60,9 +63,9 @@ def measure_outcomes(request: Request, measurements: Measurements) -> None:
     if request.outcomes_measured:
         return
     request.outcomes_measured = True
-    for interfaces, outcome in interface_outcomes(request):
-        measurements.judged_interfaces(interfaces, outcome)
     copies = request.started_together()
+    for interfaces, outcome in interface_outcomes(request, copies):
+        measurements.judged_interfaces(interfaces, outcome)
     accepted = [copy for copy in copies if copy.state is not CopyState.REJECTED]
     if request.observed:
         for copy in accepted:

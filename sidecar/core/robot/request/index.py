@@ -53,15 +53,16 @@ class RequestIndex:
         """Note that none of the request's copies may be answered any more."""
         self._stranded[request.id] = request
 
-    def remove(self, request: Request) -> None:
-        """Remove a request whose copies have all ended."""
+    def remove(self, request: Request) -> bool:
+        """Remove a request whose copies have all ended; return whether it was there."""
         if self._by_id.pop(request.id, None) is None:
-            return
+            return False
         self._stranded.pop(request.id, None)
         _take_out(self._by_service, request.service, request.id)
         for number, copy in enumerate(request.copies):
             _take_out(self._by_path, copy.path, request.id)
             _take_out(self._by_server, copy.path.peer, (request.id, number))
+        return True
 
     def services(self) -> list[ServiceName]:
         """Return the services that have requests in flight."""

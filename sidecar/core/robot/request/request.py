@@ -103,6 +103,10 @@ class Request:
     """Bytes of a copy's message, fixed when it was submitted."""
     held: int = field(init=False)
     """Bytes of its payload, which stay in memory until its last copy has ended."""
+    deadline_at: float = field(init=False)
+    expires_at: float = field(init=False)
+    races: bool = field(init=False)
+    """All its copies are to be measured: it is a full race if it has several."""
     copies: list[Copy] = field(default_factory=list)
     messages: list[MessageSymbols] = field(default_factory=list)
     """Messages of the copies that may leave the request to each other: siblings."""
@@ -130,14 +134,9 @@ class Request:
 
     def __post_init__(self) -> None:
         self.held = len(self.payload or b"")
-
-    @property
-    def deadline_at(self) -> float:
-        return self.submitted_at + self.rule.deadline_s
-
-    @property
-    def expires_at(self) -> float:
-        return self.submitted_at + self.rule.lifetime_s
+        self.deadline_at = self.submitted_at + self.rule.deadline_s
+        self.expires_at = self.submitted_at + self.rule.lifetime_s
+        self.races = is_race(self.id)
 
     @property
     def is_answered(self) -> bool:
@@ -191,13 +190,8 @@ class Request:
 
         A single copy has nothing to lose against, unless it may be hedged.
         """
-        hedged = self.rule.redundancy.sends_late
-        self.observed = (len(self.copies) < 2 and not hedged) or self.is_race()
+        self.observed = self.races or (len(self.copies) < 2 and not self.rule.redundancy.sends_late)
 
     def started_together(self) -> list[Copy]:
         """Return the copies sent when the request came, or when there was a path at last."""
         return [copy for copy in self.copies if copy.sent_at == self.copies[0].sent_at and not copy.hedges]
-
-    def is_race(self) -> bool:
-        """Return whether all its copies are to be measured."""
-        return is_race(self.id)

@@ -9,7 +9,7 @@ do the requests that still wait at it.
 from __future__ import annotations
 
 from collections import OrderedDict
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 from plr.protos.model.members import ServiceUse
 from plr.sidecar.core.base.fair_share import Shares
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
     from plr.protos.model.ids import NodeName, ServiceName
     from plr.protos.model.members import Peer
-    from plr.sidecar.core.rules.service_rule import Rules
+    from plr.sidecar.core.rules.service_rule import Rules, ServiceRule
     from plr.sidecar.core.seam.application import CarriedService
     from plr.sidecar.core.seam.stats import EngineStats
     from plr.sidecar.core.transfer.routes import Routes
@@ -32,6 +32,15 @@ MAX_OFFERED = 512
 """Services offered on the robot; each costs DDS endpoints and a slot in every wait. One peer may have half."""
 WITHDRAW_AFTER_S = 15.0
 """Longer than a handover, a tunnel or the restart of a server, shorter than a person's patience with a dead service."""
+
+
+class Offered(NamedTuple):
+    """A service that is offered on the robot."""
+
+    type: str
+    rule: ServiceRule
+    servers: tuple[NodeName, ...]
+    """Those that a new request may go to."""
 
 
 class Offers:
@@ -85,6 +94,11 @@ class Offers:
         """Return the servers left out because their type differs from the configuration's or the other servers'."""
         self._choose_touched()
         return {conflict for of_service in self._conflicts.values() for conflict in of_service}
+
+    def find(self, service: ServiceName) -> Offered | None:
+        """Return a service if it is offered now."""
+        kind, rule = self._offered.get(service), self._rules.find(service)
+        return None if kind is None or rule is None else Offered(kind, rule, self.servers(service))
 
     def servers(self, service: ServiceName) -> tuple[NodeName, ...]:
         """Return the servers that a new request for this service may go to."""

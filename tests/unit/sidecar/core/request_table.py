@@ -18,10 +18,9 @@ from plr.sidecar.core.seam.stats import EngineStats
 from plr.sidecar.core.transfer.outbox import Outbox
 from plr.sidecar.core.transfer.routes import Routes
 from plr.sidecar.core.wire.messages import CancelMessage, RejectionMessage, ResponseMessage, decode_message
-from tests.support.builders import ECHO, TYPE, WLAN, WWAN, A, B, path, peer, request_id
+from tests.support.builders import ECHO, WLAN, WWAN, A, B, path, peer, request_id
 
 if TYPE_CHECKING:
-    from plr.protos.model.ids import NodeName
     from plr.sidecar.core.rules.budget import Budget
 
 WLAN_A, WWAN_B = path(WLAN, A), path(WWAN, B)
@@ -41,7 +40,7 @@ class Table:
         exploration: float = 0.0,
         budgets: tuple[Budget, ...] = (),
     ) -> None:
-        self.rule = ServiceRule(ECHO, 1.0, 10.0, idempotent=idempotent, drop_late=drop_late, exploration=exploration)
+        rule = ServiceRule(ECHO, 1.0, 10.0, idempotent=idempotent, drop_late=drop_late, exploration=exploration)
         self.routes, self.stats = Routes(), EngineStats()
         self.measurements = Measurements(self.stats.dropped)
         self.commands: list[LinkCommand] = []
@@ -49,9 +48,9 @@ class Table:
         self.judges = True
         """Answers are judged good as soon as they come."""
         self._judged = 0
-        self.sought: list[frozenset[NodeName]] = []
         self.outbox = Outbox(self.routes, self.commands.append, self.stats)
-        offers = Offers(Rules((self.rule,)), self.stats)
+        self.offers = offers = Offers(Rules((rule,)), self.stats)
+        self.rule = rule
         for one in (peer(A), peer(B, session=2)):
             offers.set_peer(one)
         self.mapping = MappingTable(self.routes)
@@ -63,15 +62,26 @@ class Table:
             self.measurements,
             self.stats,
             self.events.append,
-            self.sought.append,
+            self.commands.append,
             budgets,
         )
         self.table = RequestTable(self.parts)
         for known in SERVERS.values():
             self.routes.set_state(known, PathState.UP)
+        offers.update(self.routes, 0.0)
+
+    @property
+    def rule(self) -> ServiceRule:
+        """The rule of the requests submitted from now on."""
+        return self._rule
+
+    @rule.setter
+    def rule(self, rule: ServiceRule) -> None:
+        self._rule = rule
+        self.offers._rules = Rules((rule,))
 
     def submit(self, number: int = 1, payload: bytes = b"question", now: float = 0.0, *, begun: bool = True) -> None:
-        self.table.submit(request_id(number), ECHO, TYPE, self.rule, payload, now)
+        self.table.submit(request_id(number), ECHO, payload, now)
         for command in self.commands if begun else ():
             if isinstance(command, Send):
                 command.message.begun = True

@@ -6,14 +6,14 @@ import pytest
 
 from deploy.dev.pages.blocks import replace_blocks
 
-PAGE = "before\n\n<!-- generated: a -->\nold\n<!-- end -->\n\nbetween\n\n<!-- generated: b -->\n<!-- end -->\nafter\n"
+PAGE = "before\n\n<!-- generated: a -->\nold\n<!-- end of generated -->\n\nbetween\n\n<!-- generated: b -->\n<!-- end of generated -->\nafter\n"
 
 
 def test_the_text_around_blocks_stays() -> None:
     page = replace_blocks(PAGE, {"a": "new\n", "b": "new too\n"})
     assert page == (
-        "before\n\n<!-- generated: a -->\n\nnew\n\n<!-- end -->\n\nbetween\n\n"
-        "<!-- generated: b -->\n\nnew too\n\n<!-- end -->\nafter\n"
+        "before\n\n<!-- generated: a -->\n\nnew\n\n<!-- end of generated -->\n\nbetween\n\n"
+        "<!-- generated: b -->\n\nnew too\n\n<!-- end of generated -->\nafter\n"
     )
     assert replace_blocks(page, {"a": "new\n", "b": "new too\n"}) == page
 

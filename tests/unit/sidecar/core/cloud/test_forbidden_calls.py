@@ -2,20 +2,21 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from plr.protos.model.ids import NodeName, ServiceName
-from plr.protos.model.members import ServiceOffer
+from plr.protos.model.ids import NodeName, ServiceName, SessionId
+from plr.protos.model.members import Peer, ServiceOffer
 from plr.sidecar.core.base.slices import Backlog
 from plr.sidecar.core.base.values import PathState, RejectReason
+from plr.sidecar.core.cloud.cloud_role import CloudRole
 from plr.sidecar.core.cloud.forbidden_calls import MAX_ROBOTS, TELL_EVERY_S, ForbiddenCalls
-from plr.sidecar.core.cloud.serving import Serving, ServingParts
 from plr.sidecar.core.rules.service_rule import Rules
 from plr.sidecar.core.seam.application import ApplicationEvent, CallsForbidden, ExecuteRequest
 from plr.sidecar.core.seam.links import PathCommand, Send
 from plr.sidecar.core.seam.stats import EngineStats
+from plr.sidecar.core.transfer.engine_parts import EngineParts
 from plr.sidecar.core.transfer.outbox import Outbox
 from plr.sidecar.core.transfer.routes import Routes
 from plr.sidecar.core.wire.messages import RejectionMessage, ResponseMessage, decode_message
-from tests.support.builders import ECHO, TYPE, WLAN, path, request, rule
+from tests.support.builders import ECHO, TYPE, WLAN, path, peer, request, rule
 
 if TYPE_CHECKING:
     from plr.sidecar.core.wire.messages import Message
@@ -24,11 +25,33 @@ ROBOT, OTHER = NodeName("robot"), NodeName("robot-2")
 SECRET = ServiceName("/secret")
 
 
+class Robots:
+    """The peers: robots that may call what stands in `permits`."""
+
+    def __init__(self, *permits: tuple[NodeName, ServiceName]) -> None:
+        self.permits = set(permits)
+
+    def __contains__(self, name: object) -> bool:
+        return name in self.names()
+
+    def names(self) -> list[NodeName]:
+        return [ROBOT, OTHER]
+
+    def get(self, name: NodeName) -> Peer | None:
+        return peer(name)
+
+    def session(self, name: NodeName) -> SessionId | None:
+        return SessionId(1) if name in self.names() else None
+
+    def may_call(self, name: NodeName, service: ServiceName) -> bool:
+        return (name, service) in self.permits
+
+
 class Cloud:
-    """The serving side of a cloud that offers /echo and /secret, and lets robots call what stands in `permits`."""
+    """The role of a cloud that offers /echo and /secret, and lets robots call what stands in `permits`."""
 
     def __init__(self) -> None:
-        self.permits = {(ROBOT, ECHO)}
+        self.robots = Robots((ROBOT, ECHO))
         self.events: list[ApplicationEvent] = []
         self.commands: list[PathCommand] = []
         self.stats = EngineStats()
@@ -36,22 +59,23 @@ class Cloud:
         routes.set_state(path(WLAN, ROBOT), PathState.UP)
         routes.set_state(path(WLAN, OTHER), PathState.UP)
         outbox = Outbox(routes, self.commands.append, self.stats)
-        self.serving = Serving(
-            ServingParts(
+        self.role = CloudRole(
+            EngineParts(
                 Rules((rule("/*"),)),
+                self.robots,
                 routes,
                 outbox,
                 self.stats,
                 self.events.append,
-                lambda robot, service: (robot, service) in self.permits,
+                lambda _command: None,
                 Backlog(),
             )
         )
-        self.serving.set_offers([ServiceOffer(ECHO, TYPE), ServiceOffer(SECRET, TYPE)])
+        self.role.set_offers([ServiceOffer(ECHO, TYPE), ServiceOffer(SECRET, TYPE)])
 
     def ask(self, number: int, service: ServiceName, *, robot: NodeName = ROBOT, now: float = 1.0) -> list[Message]:
         """One request; returns what is sent back."""
-        self.serving.on_request(path(WLAN, robot), request(number, service=service), now)
+        self.role.on_message(path(WLAN, robot), request(number, service=service), now + 10.0, now)
         return self.sent()
 
     def sent(self) -> list[Message]:
@@ -69,12 +93,12 @@ def test_a_call_that_is_not_permitted_is_refused_with_its_reason_and_reaches_nob
     assert str(SECRET) in reply.text
     assert cloud.events == [CallsForbidden(ROBOT, SECRET, 1)]
     assert cloud.stats.dropped["request_forbidden"] == 1
-    assert cloud.serving.running == 0
+    assert cloud.role.executions.running == 0
 
 
 def test_it_is_not_told_whether_the_service_is_offered_or_the_cloud_drains() -> None:
     cloud = Cloud()
-    cloud.serving.drain()
+    cloud.role.drain()
     answers = [cloud.ask(number, name) for number, name in enumerate((SECRET, ServiceName("/nothing")))]
     assert [reply.reason for (reply,) in answers if isinstance(reply, RejectionMessage)] == [RejectReason.FORBIDDEN] * 2
 
@@ -105,9 +129,9 @@ def test_a_request_that_runs_when_its_permit_goes_is_answered_to_all_its_copies(
     cloud = Cloud()
     cloud.ask(1, ECHO)
     (execution,) = (event for event in cloud.events if isinstance(event, ExecuteRequest))
-    cloud.permits.clear()
-    cloud.serving.on_request(path(WLAN, ROBOT), request(1, copy=1), 1.1)
-    cloud.serving.complete(execution.execution, b"answer", 0.1, 1.2)
+    cloud.robots.permits.clear()
+    cloud.role.on_message(path(WLAN, ROBOT), request(1, copy=1), 10.0, 1.1)
+    cloud.role.complete(execution.execution, b"answer", 0.1, 1.2)
     replies = cloud.sent()
     assert [reply.copy for reply in replies if isinstance(reply, ResponseMessage)] == [0, 1]
     (reply,) = cloud.ask(2, ECHO)

@@ -56,7 +56,7 @@ def test_a_goodbye_of_a_session_that_is_over_says_nothing_of_the_next() -> None:
     sidecar.view(peer(A, session=2, incarnation=2), version=2)
     sidecar.change(PathState.UP)
     sidecar.take()
-    sidecar.engine.submit(request_id(1), ECHO, b"", 0.1)
+    sidecar.engine.robot.requests.submit(request_id(1), ECHO, b"", 0.1)
     sidecar.engine.on_link_event(PeerClosed(A, SessionId(1)), 0.2)
     assert sidecar.engine.routes.reaches(A)
     sidecar.receive(ResponseMessage(request_id(1), 0, 0.01, b"answer"), session=2)
@@ -92,7 +92,7 @@ def answers_under_way(sidecar: Sidecar) -> int:
 def silent() -> Sidecar:
     """A cloud whose robot was answered, fell silent, and is not in the control plane's view any more."""
     sidecar = busy_cloud()
-    sidecar.engine.complete(ExecutionId(0), b"answer", 0.01, 0.5)
+    sidecar.engine.cloud.complete(ExecutionId(0), b"answer", 0.01, 0.5)
     assert answers_under_way(sidecar) == 1
     sidecar.change(PathState.DOWN)
     (answer,) = sidecar.engine._outbox._messages.values()
@@ -121,4 +121,4 @@ def test_they_go_when_that_session_is_over(silent: Sidecar, how: str) -> None:
         removed = (RemovedPeer(ROBOT, RemovalReason.LEFT),)
         assert silent.engine.apply_peers(PeerSet(Version(3), 1, (), removed), 1.0) is None
     assert answers_under_way(silent) == 0
-    assert not silent.engine._away
+    assert not silent.engine.cloud._away

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import pytest
 
-from plr.sidecar.core.base.values import Priority
+from plr.sidecar.core.base.values import PathId, PathState, Priority
 from plr.sidecar.core.robot import request_table as requests_module
 from plr.sidecar.core.wire.messages import MAX_PAYLOAD_BYTES, Encoded
-from tests.support.builders import ECHO, A, B
+from tests.support.builders import ECHO, WWAN, A, B, path
 from tests.unit.sidecar.core.request_table import WLAN_A, WWAN_B, Table
 
 
@@ -39,16 +39,20 @@ def test_requests_that_wait_are_capped_in_bytes_and_leave_room_when_they_end(mon
     assert not table.events
 
 
+def fill(table: Table, over: PathId, content: Encoded) -> None:
+    """Send this until there is no room for more."""
+    while table.outbox.has_room(over.peer, content.size):
+        table.outbox.send(over, content, priority=Priority.NORMAL, deadline=9.0, expires=9.0)
+
+
 def test_a_full_outbox_towards_one_server_sends_to_the_other_only_and_two_full_ones_let_it_wait() -> None:
     table = Table()
     huge = Encoded(b"", bytes(8_000_000))
-    while table.outbox.send(WLAN_A, huge, priority=Priority.NORMAL, deadline=9.0, expires=9.0) is not None:
-        pass
+    fill(table, WLAN_A, huge)
     table.sent()
     table.submit(1, payload=bytes(8_000_000))
     assert table.sent() == [WWAN_B]
-    while table.outbox.send(WWAN_B, huge, priority=Priority.NORMAL, deadline=9.0, expires=9.0) is not None:
-        pass
+    fill(table, WWAN_B, huge)
     table.sent()
     table.submit(2, payload=bytes(8_000_000))
     assert table.sent() == []
@@ -57,6 +61,18 @@ def test_a_full_outbox_towards_one_server_sends_to_the_other_only_and_two_full_o
     table.outbox.drop(next(iter(table.outbox._messages.values())))
     table.table.on_room(0.5)
     assert table.sent() == [WLAN_A]
+
+
+def test_a_second_copy_to_a_server_is_left_out_if_the_first_one_took_its_room() -> None:
+    table = Table(idempotent=False)
+    table.routes.forget_peer(B)
+    table.routes.set_state(path(WWAN, A), PathState.UP)
+    fill(table, WLAN_A, Encoded(b"", bytes(8_000_000)))
+    table.outbox.drop(next(iter(table.outbox._messages.values())))
+    table.sent()
+    table.submit(1, payload=bytes(7_900_000))
+    assert table.sent() == [WLAN_A]
+    assert table.stats.dropped["outbox_full"] == 1
 
 
 @pytest.mark.audit("dp-10")

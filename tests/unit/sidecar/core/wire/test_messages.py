@@ -19,6 +19,7 @@ from plr.sidecar.core.wire.messages import (
     RevocationsWanted,
     decode_message,
     encode_message,
+    request_bytes,
 )
 
 ID = RequestId(bytes(range(16)))
@@ -109,3 +110,9 @@ def test_times_out_of_range_are_cut() -> None:
         decoded = decode_message(memoryview(b"".join(encode_message(ResponseMessage(ID, 0, seconds, b"")))))
         assert isinstance(decoded, ResponseMessage)
         assert decoded.processing_s == told
+
+
+def test_the_length_of_a_request_is_known_before_it_is_encoded() -> None:
+    for service, kind, payload in (("/a", "t", b""), ("/\u00fc", "long/srv/Type", bytes(1000))):
+        message = RequestMessage(ID, 3, Priority.LOW, 0.1, 1.5, ServiceName(service), kind, payload)
+        assert request_bytes(ServiceName(service), kind, len(payload)) == encode_message(message).size

@@ -65,7 +65,7 @@ def test_a_day_has_so_many_bytes() -> None:
 
 def test_the_first_entry_that_matches_decides_and_others_are_free() -> None:
     budgets = Budgets((Budget("wlan*"), Budget("*", extra_load=0.0)), EngineStats())
-    assert budgets
+    assert budgets.limit
     assert budgets.allows(WLAN, ECHO, 10**9, 0.0)
     assert not budgets.allows(WWAN, ECHO, 1, 0.0)
-    assert not Budgets((Budget("*"),), EngineStats())
+    assert not Budgets((Budget("*"),), EngineStats()).limit

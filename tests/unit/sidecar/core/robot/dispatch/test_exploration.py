@@ -19,7 +19,7 @@ from plr.sidecar.core.robot.dispatch.exploration import (
     MIN_INTERVAL_S,
     ExplorationBudget,
 )
-from tests.support.builders import ECHO, TYPE, WLAN, WWAN, A, B, path
+from tests.support.builders import ECHO, WLAN, WWAN, A, B, path
 from tests.unit.sidecar.core.request_table import RACE, WLAN_A, WWAN_B, Table
 
 WLAN_B = path(WLAN, B)
@@ -87,7 +87,7 @@ def explored(table: Table, share: float, interval_s: float, requests: int) -> li
     times = []
     for number in range(requests):
         now = number * interval_s
-        table.table.submit(RequestId(rng.randbytes(16)), ECHO, TYPE, table.rule, b"", now)
+        table.table.submit(RequestId(rng.randbytes(16)), ECHO, b"", now)
         times += [now] * table.sent().count(WLAN_B)
         for message in list(table.outbox._messages.values()):
             table.outbox.drop(message)

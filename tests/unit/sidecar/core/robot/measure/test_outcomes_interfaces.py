@@ -39,7 +39,7 @@ def told(
     number = next(n for n in range(1, 100) if (request_id(n)[-1] % OBSERVED_ONE_IN == 0) is raced)
     rule = ServiceRule(ECHO, 1.0, 10.0, idempotent=True, redundancy=mode)
     request = Request(request_id(number), ECHO, TYPE, rule, None, 0.0, copies=list(copies), dark=dark)
-    found = list(interface_outcomes(request))
+    found = list(interface_outcomes(request, request.started_together()))
     assert all(outcome.raced is raced for _, outcome in found)
     return {
         (pair.first, pair.second, pair.server): (outcome.first_missed, outcome.second_missed) for pair, outcome in found
