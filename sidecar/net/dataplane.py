@@ -158,10 +158,10 @@ class ThreadedDataPlane:
         with self._turn as (engine, now):
             engine.judge_answer(request_id, copy, problem, now)
 
-    def answered_here(self, request_id: RequestId) -> None:
+    def answered_locally(self, request_id: RequestId) -> None:
         """Robot: note that the application got its answer on the robot."""
         with self._turn as (engine, now):
-            engine.answered_here(request_id, now)
+            engine.answered_locally(request_id, now)
 
     def complete(self, execution: ExecutionId, payload: bytes, processing_s: float) -> None:
         """Cloud: send the local server's answer."""

@@ -192,9 +192,9 @@ class Engine:
         self._requests.judge_answer(request_id, copy, problem, now)
         self._count_in_flight()
 
-    def answered_here(self, request_id: RequestId, now: float) -> None:
+    def answered_locally(self, request_id: RequestId, now: float) -> None:
         """Robot: note that the application got its answer on the robot."""
-        self._requests.answered_here(request_id, now)
+        self._requests.answered_locally(request_id, now)
         self._count_in_flight()
 
     def complete(self, execution: ExecutionId, payload: bytes, processing_s: float, now: float) -> None:

@@ -103,13 +103,13 @@ class RequestTable:
         self._parts.measurements.outcome(service, "rejected")
         self._parts.emit(RequestFailed(request_id, service, "rejected", why, 0.0))
 
-    def answered_here(self, request_id: RequestId, now: float) -> None:
+    def answered_locally(self, request_id: RequestId, now: float) -> None:
         """Note that the application got its answer on the robot. The request ends at its deadline at the latest."""
         request = self._requests.get(request_id)
         if request is not None and not request.done:
-            request.answered_here = True
+            request.answered_locally = True
             if now >= request.deadline_at:
-                self._end_answered_here(request, now)
+                self._end_answered_locally(request, now)
 
     def _problem(self, request: Request) -> str | None:
         size = len(request.payload or b"")
@@ -487,8 +487,8 @@ class RequestTable:
                 self._settle(request, now)
             elif request.judged:
                 pass  # about to be answered, in time, or rescued
-            elif request.answered_here:
-                self._end_answered_here(request, now)
+            elif request.answered_locally:
+                self._end_answered_locally(request, now)
             elif not request.missed:
                 self._miss(request)
                 if request.rule.idempotent and request not in self._no_room:  # it does not overtake those that wait
@@ -499,7 +499,7 @@ class RequestTable:
         copies = tuple(Assignment(copy.path.interface, copy.path.peer) for copy in request.copies)
         self._parts.emit(DeadlineMissed(request.id, request.service, request.rule.deadline_s, copies))
 
-    def _end_answered_here(self, request: Request, now: float) -> None:
+    def _end_answered_locally(self, request: Request, now: float) -> None:
         """End a request that the network has not answered by the deadline: it missed and need not answer any more."""
         if not request.observed:
             self._calling_off.call_off(request, request.pending(), now)

@@ -185,7 +185,7 @@ class RobotSide:
             answer.service,
             answer.request_id.hex(),
         )
-        self._data_plane.answered_here(answer.request_id)
+        self._data_plane.answered_locally(answer.request_id)
 
     def _answer(
         self, request_id: RequestId, payload: bytes | memoryview, now: float, *, late: bool

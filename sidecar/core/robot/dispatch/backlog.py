@@ -48,7 +48,7 @@ class NoRoom:
 
     def consider(self, request: Request, *, rejected: bool = False) -> None:
         """Let a request wait if it could be sent now (or again) and lacks nothing but room."""
-        if request.id in self._waiting or request.answered_here or not request.may_be_sent():
+        if request.id in self._waiting or request.answered_locally or not request.may_be_sent():
             return
         reached = self._reached(self._dispatching.candidates(request, rejected=rejected))
         lane = Lane.of(request.size)

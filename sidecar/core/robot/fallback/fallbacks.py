@@ -141,7 +141,7 @@ class Fallbacks:
     def has_answered(self, request_id: RequestId) -> bool:
         """Return whether the application has its answer from the fallback."""
         found = self._requests.get(request_id)
-        return found is not None and found[1].answered_here
+        return found is not None and found[1].answered_locally
 
     def network_answered(self, request_id: RequestId, now: float) -> None:
         """Note that the application has a valid answer from the network."""
@@ -203,7 +203,7 @@ class Fallbacks:
         else:
             self._outcomes[name, "late" if late else "won"] += 1
             if not (late and queue.drop_late):
-                request.answered = request.answered_here = True
+                request.answered = request.answered_locally = True
                 accepted = Accepted(name, late)
         self._end(name, request)
         self._call(name, now)
