@@ -82,8 +82,8 @@ class CloudSide:
         self._in_doubt: frozenset[ServiceRunner] = frozenset()
         """Runners at work whose server has been silent for so long that it must be heard to count as alive."""
         self._check_at = 0.0
-        self.look_is_due = False
-        """Whether a look at the graph is due although it has not changed."""
+        self.scan_is_due = False
+        """Whether a scan of the graph is due although it has not changed."""
         self._paced: set[ServiceRunner] = set()
         """Runners with requests that wait for room at their server."""
 
@@ -190,7 +190,7 @@ class CloudSide:
         self._forget(execution.id)
         self._stats.answers_taken[runner.name] += 1
         if (server := runner.server.only) is not None and self._roll_call.answered(server, now):
-            self.look_is_due = True
+            self.scan_is_due = True
         self._data_plane.complete(execution.id, payload, now - execution.arrived_at)
 
     def _unsent(self, runner: ServiceRunner, execution: Execution, why: str) -> None:
@@ -203,12 +203,12 @@ class CloudSide:
     # -- what the graph shows ------------------------------------------------------------------------------------
 
     def settling(self) -> bool:
-        """Return whether another look at the graph should follow soon, even if it does not change."""
+        """Return whether another scan of the graph should follow soon, even if it does not change."""
         return any(not runner.server.ready for runner in self._runners.values())
 
-    def look(self) -> Iterator[None]:
+    def scan(self) -> Iterator[None]:
         """Compare the graph with the clients, in small steps; tell the data plane what is now offered."""
-        self._names.begin_look()
+        self._names.begin_scan()
         served = yield from graph.scan(self._loop.node, self._names.name_of, self._is_in_rules, time.monotonic())
         self._stats.scans += 1
         now = time.monotonic()
@@ -225,12 +225,12 @@ class CloudSide:
             yield
             runner = self._runners.get(name)
             if runner is not None:
-                self._look_at(runner, time.monotonic())
+                self._scan_servers(runner, time.monotonic())
                 self._notice_several_servers(runner, served[name].applications().get(type_name, frozenset()))
             elif retry_types or name not in self._missing_types:
                 self._open_runner(name, type_name)
         yield
-        self._names.end_look()
+        self._names.end_scan()
         self._processes.forget_the_gone()
         self._roll_call.keep(graph.participants(self._loop.node))
         self._publish_state()
@@ -282,9 +282,9 @@ class CloudSide:
             log.warning("service %s is served here with several types, %s: robots get %s", name, served, chosen)
         return chosen
 
-    def _look_at(self, runner: ServiceRunner, now: float) -> None:
-        """Look at a runner's servers; give up its executions if its server is gone, even if another replaced it."""
-        if runner.server.look(self._is_dead, now):
+    def _scan_servers(self, runner: ServiceRunner, now: float) -> None:
+        """Scan a runner's servers; give up its executions if its server is gone, even if another replaced it."""
+        if runner.server.scan(self._is_dead, now):
             log.warning("service %s: its server is gone or was replaced by another", runner.name)
             self._give_up_executions(runner, "the server was replaced")
         if runner.server.lost:
@@ -413,7 +413,7 @@ class CloudSide:
         for runner in hit:
             self._give_up_executions(runner, "the server's process ended")
         self._publish_state()
-        self.look_is_due = True  # for those of another type
+        self.scan_is_due = True  # for those of another type
 
     def _notice_silence(self) -> None:
         """Refuse what waits for servers that show no sign of life; what they already have may still be answered."""
@@ -426,7 +426,7 @@ class CloudSide:
             self._paced.discard(runner)
             self._refuse_executions(runner.take_back_unsent(), runner.name, RejectReason.NOT_OFFERED, why)
         self._publish_state()
-        self.look_is_due = True  # for those that are heard again
+        self.scan_is_due = True  # for those that are heard again
 
     def _endpoints_to_ask(self, now: float) -> list[bytes]:
         """Return the ids of servers whose silence may mean that they are dead, and of those found silent before."""
@@ -475,7 +475,7 @@ class CloudSide:
             self._check_at = now + (POLL_S if self._roll_call.under_way else CHECK_EVERY_S)
             self._paced |= self._at_work  # a server that was heard may get more than it answers
         if self._names.turn(now):
-            self.look_is_due = True
+            self.scan_is_due = True
         for runner in tuple(self._paced):
             due = runner.window.next_due()
             if due is None:

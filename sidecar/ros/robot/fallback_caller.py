@@ -213,7 +213,7 @@ class FallbackCaller:
 
     # -- what the graph shows --------------------------------------------------------------------------------------
 
-    def look(self, served: Mapping[ServiceName, Served], offers: Mapping[ServiceName, str], now: float) -> None:
+    def follow(self, served: Mapping[ServiceName, Served], offers: Mapping[ServiceName, str], now: float) -> None:
         """Track the fallbacks in the graph; they must have the types in `offers`, the services of the network."""
         retry_types = now - self._types_retried_at >= TYPE_RETRY_S
         if retry_types:
@@ -258,7 +258,7 @@ class FallbackCaller:
             self._close(service, now)
             fallback = None
         if fallback is not None:
-            if fallback.server.look(self._processes.has_ended, now):
+            if fallback.server.scan(self._processes.has_ended, now):
                 self._replaced(service, now)
             for endpoint in fallback.server.endpoints:
                 self._processes.watch(endpoint)

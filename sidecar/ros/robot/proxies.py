@@ -62,7 +62,7 @@ class Proxies:
         self._free_since: dict[ServiceName, float] = {}
         self._types_retried_at = 0.0
         self.settling = False
-        """Whether a name is about to be free, so that another look is needed soon."""
+        """Whether a name is about to be free, so that another scan is needed soon."""
         self._settled_at = now + DISCOVERY_SETTLES_S
 
     def offer(self, event: OfferService) -> None:
@@ -92,7 +92,7 @@ class Proxies:
             log.warning("service %s is withdrawn: %s", event.name, event.reason)
         self._publish_state()
 
-    def look(
+    def follow(
         self, served: Mapping[ServiceName, graph.Served], fallbacks: Mapping[ServiceName, str], now: float
     ) -> Iterator[None]:
         """Compare the graph with what should be offered, in steps; create and withdraw proxies accordingly."""

@@ -110,8 +110,8 @@ class RobotSide:
             on_bad_request=self._bad_request,
             on_closed=self._proxy_closed,
         )
-        self.look_is_due = False
-        """Whether a look at the graph is due although it has not changed."""
+        self.scan_is_due = False
+        """Whether a scan of the graph is due although it has not changed."""
 
     # -- what the data plane says ------------------------------------------------------------------------------
 
@@ -129,7 +129,7 @@ class RobotSide:
             case OfferService():
                 self._proxies.offer(event)
                 self._publish_carried()
-                self.look_is_due = True
+                self.scan_is_due = True
             case WithdrawService():
                 self._proxies.withdraw(event, self._fallbacks.types())
                 self._publish_carried()
@@ -305,23 +305,23 @@ class RobotSide:
     # -- what the graph shows ------------------------------------------------------------------------------------
 
     def settling(self) -> bool:
-        """Return whether another look at the graph should follow soon, even if it does not change."""
+        """Return whether another scan of the graph should follow soon, even if it does not change."""
         return self._fallbacks.settling or self._proxies.settling
 
-    def look(self) -> Iterator[None]:
+    def scan(self) -> Iterator[None]:
         """Compare the graph with what is offered and with the fallbacks, in small steps."""
         if not self._proxies.offers and not self._fallbacks.configured:
             return
         wanted = frozenset(self._proxies.offers) | self._fallbacks.wanted
-        self._names.begin_look()
+        self._names.begin_scan()
         served = yield from graph.scan(self._loop.node, self._names.name_of, wanted.__contains__, time.monotonic())
         self._stats.scans += 1
         now = time.monotonic()
-        self._fallbacks.look(served, self._proxies.offers, now)
-        self._names.end_look()
+        self._fallbacks.follow(served, self._proxies.offers, now)
+        self._names.end_scan()
         self._processes.forget_the_gone()
         yield
-        yield from self._proxies.look(served, self._fallbacks.types(), now)
+        yield from self._proxies.follow(served, self._fallbacks.types(), now)
         self._publish_carried()
 
     def _publish_carried(self) -> None:
@@ -353,7 +353,7 @@ class RobotSide:
                 self._send(answer, now)
         self._try_new_client(now)
         if self._names.turn(now):
-            self.look_is_due = True
+            self.scan_is_due = True
 
     def close(self) -> None:
         """Withdraw every service."""
