@@ -1,4 +1,4 @@
-"""Runs requests on one local server in the cloud, and keeps the executions that wait for its answers."""
+"""Runs requests on one local server in the cloud, and keeps the calls that wait for its answers."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(slots=True, eq=False)
-class Execution:
+class PendingCall:
     """One request on its way through a local server."""
 
     id: ExecutionId
@@ -43,9 +43,9 @@ class ServiceRunner:
         node: Any,
         name: ServiceName,
         service_type: ServiceType,
-        on_answer: Callable[[ServiceRunner, Execution, bytes, float], None],
+        on_answer: Callable[[ServiceRunner, PendingCall, bytes, float], None],
         on_stray_answer: Callable[[ServiceRunner], None],
-        on_unsent: Callable[[ServiceRunner, Execution, str], None],
+        on_unsent: Callable[[ServiceRunner, PendingCall, str], None],
         alive_since: Callable[[ServiceRunner, float], bool],
         name_of: NameOf,
     ) -> None:
@@ -56,9 +56,9 @@ class ServiceRunner:
         self._on_stray_answer = on_stray_answer
         self._on_unsent = on_unsent
         self._alive_since = partial(alive_since, self)
-        self._at_server: dict[int, Execution] = {}
-        """Executions at the server by rmw's sequence number."""
-        self.window: RequestWindow[Execution] = RequestWindow(alive_since=self._alive_since)
+        self._at_server: dict[int, PendingCall] = {}
+        """Calls at the server by rmw's sequence number."""
+        self.window: RequestWindow[PendingCall] = RequestWindow(alive_since=self._alive_since)
         self._server = LocalServer(node, name, service_type, name_of)
         self._heard_at = 0.0
         """When the server answered last, or got a request while it had none."""
@@ -70,7 +70,7 @@ class ServiceRunner:
 
     @property
     def pending(self) -> int:
-        """Number of executions at the server or waiting for it."""
+        """Number of calls at the server or waiting for it."""
         return len(self._at_server) + self.window.waiting
 
     @property
@@ -83,31 +83,29 @@ class ServiceRunner:
         """Start of the server's silence while it has something to answer, or None."""
         return self._heard_at if self._at_server else None
 
-    def add(self, execution: Execution, now: float) -> bool:
-        """Send `execution` now or as soon as the server has room; return False when it has to wait."""
+    def add(self, call: PendingCall, now: float) -> bool:
+        """Send `call` now or as soon as the server has room; return False when it has to wait."""
         window = self.window
-        window.add(
-            execution, execution.priority, execution.deadline_at, execution.expires_at, now, robot=execution.robot
-        )
+        window.add(call, call.priority, call.deadline_at, call.expires_at, now, robot=call.robot)
         self.release(now)
-        return not window.holds(execution)
+        return not window.holds(call)
 
     def release(self, now: float) -> None:
-        """Send the executions that may go now."""
-        for execution in self.window.release(now):
-            request, execution.request = execution.request, None  # it may be a large image, and is not needed again
-            if request is None or execution.expires_at <= now:
-                self._on_unsent(self, execution, "its time was over before the server had room for it")
+        """Send the calls that may go now."""
+        for call in self.window.release(now):
+            request, call.request = call.request, None  # it may be a large image, and is not needed again
+            if request is None or call.expires_at <= now:
+                self._on_unsent(self, call, "its time was over before the server had room for it")
                 continue
             try:
                 number = self._server.send(request)
             except RosBridgeError as error:
-                self._on_unsent(self, execution, str(error))
+                self._on_unsent(self, call, str(error))
                 continue
             if not self._at_server:
                 self._heard_at = now
-            execution.number = number
-            self._at_server[number] = execution
+            call.number = number
+            self._at_server[number] = call
             self.window.sent(number, now)
 
     def take(self, now: float) -> None:
@@ -115,31 +113,31 @@ class ServiceRunner:
         for number, payload in self._server.take():
             self.window.answered(number, now)
             self._heard_at = now
-            execution = self._at_server.pop(number, None)
-            if execution is None:
+            call = self._at_server.pop(number, None)
+            if call is None:
                 self._on_stray_answer(self)
             else:
-                self._on_answer(self, execution, payload, now)
+                self._on_answer(self, call, payload, now)
         self.release(now)
 
-    def abandon(self, execution: Execution) -> None:
-        """Forget `execution`; an answer to it will be stray."""
-        if execution.number is not None:
-            self._at_server.pop(execution.number, None)
-            self.window.given_up(execution.number)
+    def abandon(self, call: PendingCall) -> None:
+        """Forget `call`; an answer to it will be stray."""
+        if call.number is not None:
+            self._at_server.pop(call.number, None)
+            self.window.given_up(call.number)
         else:
-            self.window.remove(execution)
+            self.window.remove(call)
 
-    def take_back(self) -> tuple[list[Execution], list[Execution]]:
-        """Forget everything; return (executions that may have run, executions that certainly have not)."""
+    def take_back(self) -> tuple[list[PendingCall], list[PendingCall]]:
+        """Forget everything; return (calls that may have run, calls that certainly have not)."""
         sent = list(self._at_server.values())
         self._at_server.clear()
         unsent = self.take_back_unsent()
         self.window = RequestWindow(alive_since=self._alive_since)
         return sent, unsent
 
-    def take_back_unsent(self) -> list[Execution]:
-        """Forget and return the waiting executions, which certainly have not run; those at the server stay."""
+    def take_back_unsent(self) -> list[PendingCall]:
+        """Forget and return the waiting calls, which certainly have not run; those at the server stay."""
         return self.window.take_all()
 
     def close(self) -> None:

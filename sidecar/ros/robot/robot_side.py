@@ -203,7 +203,7 @@ class RobotSide:
         del self._pending[request_id]
         self._stats.pending = len(self._pending)
         answer = _Answer(pending.client, pending.proxy, pending.rmw_request_id, response)
-        if self._pacer.offer(pending.client, answer, now, late=late):
+        if self._pacer.admit(pending.client, answer, now, late=late):
             self._send(answer, now)
         else:
             self._stats.answers_paced += 1
@@ -241,7 +241,7 @@ class RobotSide:
         client, oldest = due
         if self._try_to_send(oldest, now):
             for answer in self._new_clients.known(client):
-                if self._pacer.offer(client, answer, now, late=False):
+                if self._pacer.admit(client, answer, now, late=False):
                     self._send(answer, now)
         else:
             for answer in self._new_clients.unknown(client, time.monotonic()):
