@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from plr.sidecar.core.rules.service_rule import ServiceRule
     from plr.sidecar.core.seam.application import ApplicationEvent
     from plr.sidecar.ports import Application, DataPlane
+    from plr.sidecar.ros.ros_loop import Waited
 
 DRAIN_S = 0.005
 """Time the ROS thread spends on the data plane's events before it takes the servers' answers again."""
@@ -47,6 +48,7 @@ class _Side(Protocol):
 
     def settling(self) -> bool: ...
     def handle(self, event: ApplicationEvent, now: float) -> None: ...
+    def take(self, entity: Waited, now: float) -> None: ...
     def scan(self) -> Iterator[None]: ...
     def next_due(self) -> float | None: ...
     def on_timer(self, now: float) -> None: ...
@@ -146,7 +148,7 @@ class RosBridge:
             now = time.monotonic()
             for entity in ready:  # before the events, which may destroy some of them
                 try:
-                    entity.take(now)
+                    side.take(entity, now)
                 except Exception:
                     self._note_error("take", now)
             self._drain(side, now)

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from plr.sidecar.core.seam.application import ApplicationEvent
     from plr.sidecar.ports import DataPlane
     from plr.sidecar.ros.log_limit import LimitedLog
-    from plr.sidecar.ros.ros_loop import RosLoop
+    from plr.sidecar.ros.ros_loop import RosLoop, Waited
     from plr.sidecar.ros.stats import BridgeStats
 
 MAX_PENDING_CALLS = 4096
@@ -131,7 +131,9 @@ class CloudSide:
         self._calls[event.execution] = (runner, call)
         self._shares.take(event.robot)
         self._stats.pending = len(self._calls)
-        if not runner.add(call, now):
+        runner.add(call, now)
+        self._release(runner, now)
+        if runner.window.holds(call):
             self._stats.requests_paced += 1
             self._paced.add(runner)
         self._at_work.add(runner)
@@ -186,6 +188,18 @@ class CloudSide:
 
     # -- what the local servers answer -----------------------------------------------------------------------------
 
+    def take(self, entity: Waited, now: float) -> None:
+        """Pass on the answers that have arrived from a server, and send what it has room for now."""
+        if not isinstance(entity, ServiceRunner):
+            return
+        for call, payload in entity.take(now):
+            if call is None:
+                # Its request was abandoned, or two nodes serve one name and this is the second answer.
+                self._stats.dropped["answer_without_execution"] += 1
+            else:
+                self._answered(entity, call, payload, now)
+        self._release(entity, now)
+
     def _answered(self, runner: ServiceRunner, call: PendingCall, payload: bytes, now: float) -> None:
         self._forget(call.id)
         self._stats.answers_taken[runner.name] += 1
@@ -193,12 +207,9 @@ class CloudSide:
             self.scan_is_due = True
         self._data_plane.complete(call.id, payload, now - call.arrived_at)
 
-    def _unsent(self, runner: ServiceRunner, call: PendingCall, why: str) -> None:
-        self._refuse_calls([call], runner.name, RejectReason.OVERLOADED, why)
-
-    def _stray(self, _runner: ServiceRunner) -> None:
-        """Count an answer to an abandoned request, or a second answer because two nodes serve one name."""
-        self._stats.dropped["answer_without_execution"] += 1
+    def _release(self, runner: ServiceRunner, now: float) -> None:
+        for call, why in runner.release(now):
+            self._refuse_calls([call], runner.name, RejectReason.OVERLOADED, why)
 
     # -- what the graph shows ------------------------------------------------------------------------------------
 
@@ -317,9 +328,6 @@ class CloudSide:
                 self._loop.node,
                 name,
                 load_service_type(type_name),
-                self._answered,
-                self._stray,
-                self._unsent,
                 self._is_alive_since,
                 self._names.name_of,
             )
@@ -479,7 +487,7 @@ class CloudSide:
             if due is None:
                 self._paced.discard(runner)
             elif due <= now:
-                runner.release(now)
+                self._release(runner, now)
 
     def close(self) -> None:
         """Withdraw all offers and refuse what is running."""

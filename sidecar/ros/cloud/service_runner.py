@@ -11,7 +11,7 @@ from plr.sidecar.ros.cloud.request_window import RequestWindow
 from plr.sidecar.ros.errors import RosBridgeError
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Iterator
 
     from plr.protos.model.ids import NodeName, ServiceName
     from plr.sidecar.core.base.values import ExecutionId, Priority
@@ -36,25 +36,19 @@ class PendingCall:
 
 
 class ServiceRunner:
-    """Sends requests to one local server and passes its answers, as bytes, to `on_answer`."""
+    """Sends requests to one local server and takes its answers, as bytes."""
 
     def __init__(
         self,
         node: Any,
         name: ServiceName,
         service_type: ServiceType,
-        on_answer: Callable[[ServiceRunner, PendingCall, bytes, float], None],
-        on_stray_answer: Callable[[ServiceRunner], None],
-        on_unsent: Callable[[ServiceRunner, PendingCall, str], None],
         alive_since: Callable[[ServiceRunner, float], bool],
         name_of: NameOf,
     ) -> None:
         """Take `alive_since`: whether the server has shown a sign of life, other than an answer, since then."""
         self.name = name
         self.type = service_type
-        self._on_answer = on_answer
-        self._on_stray_answer = on_stray_answer
-        self._on_unsent = on_unsent
         self._alive_since = partial(alive_since, self)
         self._at_server: dict[int, PendingCall] = {}
         """Calls at the server by rmw's sequence number."""
@@ -83,42 +77,39 @@ class ServiceRunner:
         """Start of the server's silence while it has something to answer, or None."""
         return self._heard_at if self._at_server else None
 
-    def add(self, call: PendingCall, now: float) -> bool:
-        """Send `call` now or as soon as the server has room; return False when it has to wait."""
-        window = self.window
-        window.add(call, call.priority, call.deadline_at, call.expires_at, now, robot=call.robot)
-        self.release(now)
-        return not window.holds(call)
+    def add(self, call: PendingCall, now: float) -> None:
+        """Let `call` wait until `release` finds room for it at the server."""
+        self.window.add(call, call.priority, call.deadline_at, call.expires_at, now, robot=call.robot)
 
-    def release(self, now: float) -> None:
-        """Send the calls that may go now."""
+    def release(self, now: float) -> list[tuple[PendingCall, str]]:
+        """Send the calls that may go now; return those that cannot be sent, and why."""
+        unsent: list[tuple[PendingCall, str]] = []
         for call in self.window.release(now):
             request, call.request = call.request, None  # it may be a large image, and is not needed again
             if request is None or call.expires_at <= now:
-                self._on_unsent(self, call, "its time was over before the server had room for it")
+                unsent.append((call, "its time was over before the server had room for it"))
                 continue
             try:
                 number = self._server.send(request)
             except RosBridgeError as error:
-                self._on_unsent(self, call, str(error))
+                unsent.append((call, str(error)))
                 continue
             if not self._at_server:
                 self._heard_at = now
             call.number = number
             self._at_server[number] = call
             self.window.sent(number, now)
+        return unsent
 
-    def take(self, now: float) -> None:
-        """Take the answers that have arrived."""
+    def take(self, now: float) -> Iterator[tuple[PendingCall | None, bytes]]:
+        """Yield the answers that have arrived, each with its call; None stands for one that is not awaited.
+
+        There may be room then for waiting calls: see `release`.
+        """
         for number, payload in self._server.take():
             self.window.answered(number, now)
             self._heard_at = now
-            call = self._at_server.pop(number, None)
-            if call is None:
-                self._on_stray_answer(self)
-            else:
-                self._on_answer(self, call, payload, now)
-        self.release(now)
+            yield self._at_server.pop(number, None), payload
 
     def abandon(self, call: PendingCall) -> None:
         """Forget `call`; an answer to it will be stray."""

@@ -21,12 +21,13 @@ from plr.sidecar.ros.errors import RosBridgeError
 from plr.sidecar.ros.graph import graph
 from plr.sidecar.ros.graph.node_names import NodeNames
 from plr.sidecar.ros.rcl import NewClientError
-from plr.sidecar.ros.robot.fallback_caller import FallbackCaller
+from plr.sidecar.ros.robot.fallback_caller import Fallback, FallbackCaller
 from plr.sidecar.ros.robot.new_clients import GIVE_UP_S, NewClients
 from plr.sidecar.ros.robot.notices import NoticePublisher
 from plr.sidecar.ros.robot.proxies import Proxies
 from plr.sidecar.ros.robot.reply_pacer import ReplyPacer
 from plr.sidecar.ros.robot.request_numbering import RequestNumbering
+from plr.sidecar.ros.robot.service_proxy import ServiceProxy
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -38,8 +39,7 @@ if TYPE_CHECKING:
     from plr.sidecar.ros.log_limit import LimitedLog
     from plr.sidecar.ros.rcl import Message, RmwRequestId
     from plr.sidecar.ros.robot.fallback_caller import FallbackAnswer
-    from plr.sidecar.ros.robot.service_proxy import ServiceProxy
-    from plr.sidecar.ros.ros_loop import RosLoop
+    from plr.sidecar.ros.ros_loop import RosLoop, Waited
     from plr.sidecar.ros.stats import BridgeStats
 
 MAX_PENDING_REQUESTS = 4096
@@ -95,7 +95,6 @@ class RobotSide:
             limited_log=limited_log,
             processes=self._processes,
             name_of=self._names.name_of,
-            on_answer=self._answer_from_fallback,
             on_failure=self._tell_failure,
         )
         self._pending: dict[RequestId, _Pending] = {}
@@ -106,8 +105,6 @@ class RobotSide:
             rules=rules,
             stats=stats,
             now=now,
-            on_request=self._submit,
-            on_bad_request=self._bad_request,
             on_closed=self._proxy_closed,
         )
         self.scan_is_due = False
@@ -270,7 +267,19 @@ class RobotSide:
         )
         self._notices.request_failed(event)
 
-    # -- what applications ask -----------------------------------------------------------------------------------
+    # -- what applications ask, and what fallbacks answer -----------------------------------------------------------
+
+    def take(self, entity: Waited, now: float) -> None:
+        """Pass on the requests that have arrived at a proxy, or give applications the answers of a fallback."""
+        if isinstance(entity, ServiceProxy):
+            for request in entity.take():
+                if isinstance(request, RosBridgeError):
+                    self._bad_request(entity, request, now)
+                else:
+                    self._submit(entity, *request, now)
+        elif isinstance(entity, Fallback):
+            for answer in self._fallbacks.take(entity, now):
+                self._answer_from_fallback(answer, now)
 
     def _submit(self, proxy: ServiceProxy, rmw_request_id: RmwRequestId, payload: bytes, now: float) -> None:
         self._stats.requests_taken[proxy.name] += 1
