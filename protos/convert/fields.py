@@ -55,7 +55,7 @@ MAX_CAPACITY = 1_000_000
 MAX_COST_PER_REQUEST = 1e9
 """Largest cost of a request over an interface or at a server; a larger one is a mistake."""
 
-MAX_COPIES = 256
+MAX_MAPPED_COPIES = 256
 """Copies of one request: as many as a robot can have interfaces."""
 
 US_PER_S = 1_000_000

@@ -24,7 +24,7 @@ from plr.sidecar.core.base.timers import first_of
 from plr.sidecar.core.base.values import PathId, PathState, RejectReason, RequestId
 from plr.sidecar.core.robot.dispatch.backlog import NoRoom
 from plr.sidecar.core.robot.dispatch.cancelling import SMALL_ANSWER_BYTES, CallingOff
-from plr.sidecar.core.robot.dispatch.dispatcher import MAX_COPIES, Dispatching
+from plr.sidecar.core.robot.dispatch.dispatcher import MAX_COPIES_OF_REQUEST, Dispatching
 from plr.sidecar.core.robot.measure.outcomes import measure_outcomes
 from plr.sidecar.core.robot.request.request import Answer, Copy, CopyState, Request
 from plr.sidecar.core.seam.application import DeadlineMissed, RequestFailed, ResponseArrived, Unreachable
@@ -44,8 +44,8 @@ MAX_IN_FLIGHT = 8192
 RETRY_S = 0.05
 """A request that was refused for the moment is asked again after twice this, doubled with each copy, ..."""
 MAX_RETRY_S = 2.0
-"""... and after no more than this for the first MAX_COPIES. Then the time doubles again, so that a server that takes
-minutes to start is still asked before the request's lifetime ends, and few bytes travel in vain."""
+"""... and after no more than this for the first MAX_COPIES_OF_REQUEST. Then the time doubles again, so that a server
+that takes minutes to start is still asked before the request's lifetime ends, and few bytes travel in vain."""
 MAX_HELD_BYTES = 256 * 1024 * 1024
 """Most payload bytes held. A payload is held until its request's last copy has ended, also while the request waits for
 a path or for room."""
@@ -320,7 +320,7 @@ class RequestTable:
         request.refusal = reason
         self._requests.strand(request)
         copies = len(request.copies)
-        retry_s = min(RETRY_S * 2**copies, MAX_RETRY_S) * 2 ** max(0, copies - MAX_COPIES)
+        retry_s = min(RETRY_S * 2**copies, MAX_RETRY_S) * 2 ** max(0, copies - MAX_COPIES_OF_REQUEST)
         request.retry_at = now + retry_s
         self._look_at(request, request.retry_at)
         self._tell_unreachable(request)

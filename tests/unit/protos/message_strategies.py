@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from plr.protos.base.histogram import BUCKETS, MAX_COUNT, Histogram
 from plr.protos.base.size_class import SIZE_CLASSES
 from plr.protos.convert.control import MAX_WALL_S
-from plr.protos.convert.fields import MAX_CAPACITY, MAX_COPIES, MAX_COST_PER_REQUEST, MAX_DURATION_S, MAX_EVENTS
+from plr.protos.convert.fields import MAX_CAPACITY, MAX_COST_PER_REQUEST, MAX_DURATION_S, MAX_EVENTS, MAX_MAPPED_COPIES
 from plr.protos.convert.types import LEAST_TARGET
 from plr.protos.model.explanation import (
     Alternative,
@@ -133,8 +133,8 @@ def _tuples(
 
 costs = st.floats(0.0, MAX_COST_PER_REQUEST)
 domain_labels = st.just("") | st.from_regex(r"[A-Za-z0-9][A-Za-z0-9_.&+-]{0,10}", fullmatch=True)
-copies = st.tuples(st.integers(0, MAX_COPIES), st.just(0)) | st.tuples(
-    st.integers(1, MAX_COPIES), st.integers(1, MAX_COPIES)
+copies = st.tuples(st.integers(0, MAX_MAPPED_COPIES), st.just(0)) | st.tuples(
+    st.integers(1, MAX_MAPPED_COPIES), st.integers(1, MAX_MAPPED_COPIES)
 ).map(sorted)
 offers = st.builds(ServiceOffer, service_names, type_names, st.integers(0, MAX_CAPACITY), costs)
 uses = st.builds(

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from plr.sidecar.core.robot.dispatch.context import RequestParts
     from plr.sidecar.core.wire.messages import Encoded
 
-MAX_COPIES = 8
+MAX_COPIES_OF_REQUEST = 8
 """Most copies of one request, including those sent in trouble."""
 MAX_ASKED = 16
 """The same while it is certain that no server ran any of them, and each was given time to become ready."""
@@ -143,7 +143,7 @@ class Dispatching:
         waiting = request.relied_on()
         if request.is_answered or (waiting and not request.rule.redundancy.helps):
             return
-        if rejected and len(request.copies) >= MAX_COPIES:
+        if rejected and len(request.copies) >= MAX_COPIES_OF_REQUEST:
             return  # its retry goes on asking, without haste
         alive = any(routes.state(copy.path) is not PathState.DOWN for copy in waiting)
         if alive and not insist and MODES[request.rule.redundancy].watches(self, request, now):
@@ -281,4 +281,4 @@ class Dispatching:
 
 def _most_copies(request: Request) -> int:
     patient = request.retry_at is None and request.certainly_not_run()
-    return MAX_ASKED if patient else MAX_COPIES
+    return MAX_ASKED if patient else MAX_COPIES_OF_REQUEST

@@ -36,7 +36,7 @@ MAX_REQUEST_BYTES = 128 * 1024
 """Larger requests are not worth exploring with. A service costs at most 1.6 MB a minute more."""
 
 MAX_MAPPED_COPIES = 4
-"""A request with more copies does not explore: half of `dispatcher.MAX_COPIES`, the rest is for trouble."""
+"""A request with more copies does not explore: half of `dispatcher.MAX_COPIES_OF_REQUEST`, the rest is for trouble."""
 
 MAX_WAITING_MESSAGES = 4
 """An interface with more undelivered messages is busy: an unnecessary copy would hold others up."""

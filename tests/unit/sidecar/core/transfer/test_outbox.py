@@ -4,7 +4,7 @@ from typing import TYPE_CHECKING
 
 from plr.sidecar.core.base.values import PathState, Priority, RequestId
 from plr.sidecar.core.message.reassembly import MAX_PEER_BYTES
-from plr.sidecar.core.message.repair import MAX_COPIES
+from plr.sidecar.core.message.repair import MAX_DOUBLED_SYMBOLS
 from plr.sidecar.core.seam.links import FragmentsLost, LinkCommand, Resend, Send, SendAbandon
 from plr.sidecar.core.seam.stats import EngineStats
 from plr.sidecar.core.transfer.outbox import MAX_GENERATIONS, Outbox
@@ -142,8 +142,8 @@ def test_many_symbols_lost_at_once_travel_once() -> None:
     box = Box(OVER_WLAN)
     message = box.send(size=100_000)
     lossy(box, OVER_WLAN)
-    box.lost(message, *range(MAX_COPIES + 1))
-    assert box.commands == [Resend(OVER_WLAN, message, tuple(range(MAX_COPIES + 1)))]
+    box.lost(message, *range(MAX_DOUBLED_SYMBOLS + 1))
+    assert box.commands == [Resend(OVER_WLAN, message, tuple(range(MAX_DOUBLED_SYMBOLS + 1)))]
 
 
 def test_copies_do_not_hold_back_what_an_interface_took_with_it() -> None:
