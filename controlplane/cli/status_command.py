@@ -21,7 +21,7 @@ from plr.protos.convert import (
     status_from_proto,
     status_query_to_proto,
 )
-from plr.protos.convert.fields import MAX_SIDECARS
+from plr.protos.convert.fields import MAX_LISTED_SIDECARS
 from plr.protos.model.names import node_name
 from plr.protos.model.status import StatusQuery
 from plr.protos.plr.v1 import admin_pb2
@@ -75,8 +75,8 @@ class _Answer:
     def take(self, part: admin_pb2.GetStatusResponse) -> None:
         """Add a part of the answer; raises DecodeError."""
         self.sidecars += status_from_proto(part)
-        if len(self.sidecars) > MAX_SIDECARS:
-            raise DecodeError(f"sidecars has more than {MAX_SIDECARS} elements")
+        if len(self.sidecars) > MAX_LISTED_SIDECARS:
+            raise DecodeError(f"sidecars has more than {MAX_LISTED_SIDECARS} elements")
         if self.raw is not None:
             self.raw.MergeFrom(part)
         del part.sidecars[:]

@@ -16,7 +16,6 @@ import grpc
 from grpc_health.v1 import health, health_pb2, health_pb2_grpc
 from grpc_reflection.v1alpha import reflection
 
-from plr.controlplane.core.registry.registry import MAX_SIDECARS
 from plr.controlplane.loop import ControlLoop
 from plr.controlplane.observe.event_log import EventLog
 from plr.controlplane.observe.metrics import Metrics
@@ -28,6 +27,7 @@ from plr.controlplane.serve.stun_server import start_stun_server
 from plr.controlplane.serve.tls_gate import TlsGate
 from plr.protos.base.host_port import split_host_port
 from plr.protos.model.fleet_events import EventKind
+from plr.protos.model.members import MAX_SIDECARS
 from plr.protos.program.version_option import describe
 from plr.protos.trust.clock_floor import ClockFloor
 

@@ -31,6 +31,7 @@ from plr.controlplane.serve.gate_pipe import PipeEnd
 from plr.controlplane.serve.half_open import HalfOpen
 from plr.controlplane.serve.handshakes import server_context, why_failed
 from plr.protos.base.token_bucket import TokenBucket
+from plr.protos.model.members import MAX_SIDECARS
 from plr.protos.trust.identity import CertificateError, IdentityRole
 
 if TYPE_CHECKING:
@@ -64,7 +65,7 @@ ON_THE_WAY_S = 1.0
 """How long one counts as such without a certificate: three round trips over a slow network. A stranger that takes
 longer keeps nobody waiting."""
 
-MAX_WAITING = 4096 + 256
+MAX_WAITING = MAX_SIDECARS + 256
 """Connections that wait for their turn: the largest fleet. They have no TLS state yet; each costs a descriptor and a
 few kB."""
 
@@ -80,7 +81,7 @@ MAX_SILENT = 2048
 MAX_SILENT_PER_SOURCE = 1024
 """The same from one address."""
 
-MAX_CONNECTIONS = 2 * 4096 + 64
+MAX_CONNECTIONS = 2 * MAX_SIDECARS + 64
 """Concurrent connections: one for each sidecar that may register, its replacement, and some for operators."""
 
 MAX_CONNECTIONS_PER_NAME = 8

@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING
 from plr.protos.base.errors import DecodeError
 from plr.protos.convert.control import revocations_from_proto, revocations_to_proto
 from plr.protos.convert.fields import (
+    MAX_LISTED_SIDECARS,
     MAX_MAPPED_SERVICES,
     MAX_OFFERS,
-    MAX_SIDECARS,
     MAX_USES,
     duration,
     each,
@@ -51,7 +51,7 @@ _SYNC_STATE_NUMBERS = {state: number for number, state in _SYNC_STATES.items()}
 
 def status_from_proto(message: admin_pb2.GetStatusResponse) -> tuple[SidecarStatus, ...]:
     """Check the status of all sidecars."""
-    return each(message.sidecars, MAX_SIDECARS, "sidecars", _sidecar_from_proto)
+    return each(message.sidecars, MAX_LISTED_SIDECARS, "sidecars", _sidecar_from_proto)
 
 
 def own_revocations_from_proto(message: admin_pb2.GetStatusResponse) -> RevocationSet:
@@ -68,8 +68,8 @@ def status_to_proto(
 
 def status_query_from_proto(message: admin_pb2.StreamStatusRequest) -> StatusQuery:
     """Check a query for the status."""
-    if len(message.names) > MAX_SIDECARS:
-        raise DecodeError(f"names has {len(message.names)} elements, more than {MAX_SIDECARS}")
+    if len(message.names) > MAX_LISTED_SIDECARS:
+        raise DecodeError(f"names has {len(message.names)} elements, more than {MAX_LISTED_SIDECARS}")
     unique(message.names, "names")
     return StatusQuery(tuple(node_name(name, "names") for name in message.names), message.detailed_at_most)
 

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 MAX_FLEET_EVENTS = 65_536
 """Events in one answer."""
 
-MAX_DEPARTED = 8192
+MAX_LISTED_DEPARTED = 8192
 """Departed sidecars in one status."""
 
 MAX_SERVICES = 1024
@@ -133,7 +133,7 @@ def why_to_proto(why: Why | None) -> admin_pb2.DepartureReason.ValueType:
 
 def departed_from_proto(messages: Sequence[admin_pb2.DepartedSidecar]) -> tuple[DepartedSidecar, ...]:
     """Check the departed sidecars."""
-    return each(messages, MAX_DEPARTED, "departed", _departed_from_proto)
+    return each(messages, MAX_LISTED_DEPARTED, "departed", _departed_from_proto)
 
 
 def _departed_from_proto(message: admin_pb2.DepartedSidecar) -> DepartedSidecar:

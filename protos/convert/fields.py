@@ -40,7 +40,7 @@ MAX_CRL_BYTES = 1 << 20
 MAX_STUN_SERVERS = 16
 """STUN servers in one welcome."""
 
-MAX_SIDECARS = 8192
+MAX_LISTED_SIDECARS = 8192
 """Sidecars in one status."""
 
 MAX_DURATION_S = 86_400.0

@@ -28,9 +28,8 @@ from plr.controlplane.core.publish.messages import Send
 from plr.controlplane.core.publish.snapshots import PeerView, Snapshots, VersionSource
 from plr.controlplane.core.publish.told_peers import ToldPeers
 from plr.controlplane.core.publish.views import KnownPeers, Views
-from plr.controlplane.core.registry.registry import MAX_SIDECARS
 from plr.protos.model.ids import Role, Version
-from plr.protos.model.members import POLICY_PENDING
+from plr.protos.model.members import MAX_SIDECARS, POLICY_PENDING
 from plr.protos.model.stream import ResourceKind
 
 if TYPE_CHECKING:

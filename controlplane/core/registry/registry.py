@@ -15,7 +15,15 @@ from typing import TYPE_CHECKING, NewType
 from plr.controlplane.core.overload.postponed import Postponed
 from plr.controlplane.core.overload.registration_share import RegistrationShare
 from plr.protos.model.ids import NodeName, Role
-from plr.protos.model.members import NO_REVOCATIONS, CandidateSet, Peer, Registration, RemovalReason, RevocationSet
+from plr.protos.model.members import (
+    MAX_SIDECARS,
+    NO_REVOCATIONS,
+    CandidateSet,
+    Peer,
+    Registration,
+    RemovalReason,
+    RevocationSet,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterator
@@ -25,9 +33,6 @@ if TYPE_CHECKING:
 
 StreamId = NewType("StreamId", int)
 """Number of one stream, unique in one run of the control plane."""
-
-MAX_SIDECARS = 4096
-"""Sidecars known at once: as many as one set of peers holds. A further one is refused, not let in for another."""
 
 MAX_OFFERED = 1024
 """Service names remembered for one cloud, as many as it may offer at once. Beyond that, only its present offers."""
