@@ -31,7 +31,7 @@ from plr.protos.convert.types import (
 )
 from plr.protos.model.members import MAX_UNMET, NO_REVOCATIONS, RevocationSet
 from plr.protos.model.names import clean_text, node_name, text
-from plr.protos.model.report import MAX_PATHS
+from plr.protos.model.report import MAX_PATH_REPORTS
 from plr.protos.model.status import ResourceStatus, SidecarStatus, StatusQuery, SyncState
 from plr.protos.plr.v1 import admin_pb2
 
@@ -89,7 +89,7 @@ def _sidecar_from_proto(message: admin_pb2.SidecarStatus) -> SidecarStatus:
         peers=resource_from_proto(message.peers),
         mapping=resource_from_proto(message.mapping),
         services=each(message.services, MAX_MAPPED_SERVICES, "services", service_mapping_from_proto),
-        paths=each(message.paths, MAX_PATHS, "paths", path_from_proto),
+        paths=each(message.paths, MAX_PATH_REPORTS, "paths", path_from_proto),
         refused_offers=service_names(message.refused_offers, MAX_OFFERS, "refused_offers"),
         revocations=revocations_from_proto(message.revocations),
         unmet=service_names(message.unmet, MAX_UNMET, "unmet"),

@@ -24,7 +24,7 @@ from plr.protos.model.report import (
     MAX_GOODBYES,
     MAX_JOINTS,
     MAX_LATENCIES,
-    MAX_PATHS,
+    MAX_PATH_REPORTS,
     MAX_PENALTIES,
     InterfaceJointReport,
     JointReport,
@@ -53,7 +53,7 @@ def report_from_proto(message: control_pb2.Report) -> Report:
         raise DecodeError(f"goodbyes has {len(message.goodbyes)} elements, more than {MAX_GOODBYES}")
     return Report(
         latencies=each(message.latencies, MAX_LATENCIES, "latencies", _latency_from_proto),
-        paths=each(message.paths, MAX_PATHS, "paths", path_from_proto),
+        paths=each(message.paths, MAX_PATH_REPORTS, "paths", path_from_proto),
         outcomes=each(message.outcomes, MAX_OUTCOMES, "outcomes", _outcome_from_proto),
         joints=each(message.joints, MAX_JOINTS, "joints", _joint_from_proto),
         interface_joints=each(message.interface_joints, MAX_JOINTS, "interface_joints", _interface_joint_from_proto),
@@ -70,7 +70,7 @@ def report_parts(message: control_pb2.Report) -> Iterator[Report]:
     """
     lists: tuple[tuple[str, int], ...] = (
         *(("outcomes", MAX_OUTCOMES), ("latencies", MAX_LATENCIES), ("joints", MAX_JOINTS)),
-        *(("interface_joints", MAX_JOINTS), ("paths", MAX_PATHS)),
+        *(("interface_joints", MAX_JOINTS), ("paths", MAX_PATH_REPORTS)),
     )
     for field, limit in lists:
         check_length(getattr(message, field), limit, field)

@@ -48,7 +48,7 @@ LEAST_INTERVAL_S = 0.1
 DEFAULT_BYTES = 64
 MAX_INTERFACE_CHARACTERS = 15
 """Linux's limit."""
-MAX_PATHS = 4096
+MAX_PINGED_PATHS = 4096
 """Paths to one peer; more are not counted."""
 MAX_WAITING = 128
 """Turns whose answers are awaited."""
@@ -137,13 +137,13 @@ class Pinger:
         elif line.get("end"):
             self._rounds.pop(request, None)
         elif line.get("part") == "pinged":
-            for one in line["value"][:MAX_PATHS]:
+            for one in line["value"][:MAX_PINGED_PATHS]:
                 self._pinged(turn, (one["interface"], one["remote"]))
         elif line.get("part") == "pong" and turn:
             self._pong(turn, line["value"])
 
     def _pinged(self, turn: int, key: tuple[str, int]) -> None:
-        if len(self.tallies) >= MAX_PATHS and key not in self.tallies:
+        if len(self.tallies) >= MAX_PINGED_PATHS and key not in self.tallies:
             return
         tally = self.tallies.setdefault(key, PathTally())
         if turn and turn not in tally.waiting:
