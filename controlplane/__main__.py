@@ -22,6 +22,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from plr.protos.program import endings, extras, interpreter
+from plr.protos.program.exit_codes import EXIT_FAILED, EXIT_OK, EXIT_USAGE
 
 with extras.required("plr-controlplane", "controlplane"):
     from plr.controlplane.config.controlplane import load_config, refuse_exposed
@@ -41,9 +42,6 @@ if TYPE_CHECKING:
     from plr.controlplane.serve.server import Addresses
     from plr.protos.program.tls_files import TlsFiles
 
-EXIT_OK = 0
-EXIT_FAILED = 1
-EXIT_USAGE = 2
 
 _NO_STUN_SERVERS = (
     "stun_servers is empty: sidecars are told no STUN server, and robots behind a NAT stay unreachable unless their "

@@ -18,6 +18,7 @@ from plr.controlplane.planning.workload import DEFAULT, Compute, Workload
 from plr.protos.base.printable import escaped
 from plr.protos.program import extras
 from plr.protos.program.arguments import whole
+from plr.protos.program.exit_codes import EXIT_NO, EXIT_OK, EXIT_USAGE
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -26,9 +27,6 @@ if TYPE_CHECKING:
     from plr.controlplane.planning.traces import RecordedPaths
     from plr.protos.program.arguments import Commands
 
-EXIT_MET = 0
-EXIT_NOT_MET = 1
-EXIT_USAGE = 2
 
 MAX_REQUESTS = 5_000_000
 """Most requests sent through traces in one run: some minutes."""
@@ -152,7 +150,7 @@ def _plan(arguments: argparse.Namespace) -> int:
         sys.stdout.write(json.dumps(told, indent=2) + "\n")
     else:
         sys.stdout.write(plan_text.render(source, prospects, deadline_s, arguments.target) + "\n")
-    return EXIT_NOT_MET if arguments.target is not None and least is None else EXIT_MET
+    return EXIT_NO if arguments.target is not None and least is None else EXIT_OK
 
 
 def _recorded(arguments: argparse.Namespace) -> tuple[Source, float]:

@@ -25,6 +25,7 @@ from plr.protos.base.errors import ConfigError, DecodeError
 from plr.protos.base.printable import escaped
 from plr.protos.model.names import interface_name, node_name
 from plr.protos.program.arguments import checked, number, whole
+from plr.protos.program.exit_codes import EXIT_NO, EXIT_OK
 from plr.sidecar.core.link.pinging import LEAST_BYTES
 from plr.sidecar.core.wire.frame import MAX_DATAGRAM_BYTES
 from plr.sidecar.doctor.examination import connect, read_config
@@ -41,8 +42,6 @@ if TYPE_CHECKING:
     from plr.sidecar.doctor.examination import Where
     from plr.sidecar.local.client import LocalClient
 
-EXIT_OK = 0
-EXIT_NO_ANSWER = 1
 LEAST_INTERVAL_S = 0.1
 """The sidecar sends at most 20 pings a second over an interface."""
 DEFAULT_BYTES = 64
@@ -199,7 +198,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             return _ping(client, options)
     except LocalError as error:
         sys.stderr.write(f"plr ping: {error}\n")
-        return EXIT_NO_ANSWER
+        return EXIT_NO
 
 
 def _interface(name: str, what: str) -> InterfaceName:
@@ -245,8 +244,8 @@ def _ping(client: LocalClient, options: argparse.Namespace) -> int:
         say(f"{pinger.refused} requests were not taken: the sidecar was busy with others")
     if ended is not None:
         sys.stderr.write(f"plr ping: {ended}\n")
-        return EXIT_NO_ANSWER
-    return EXIT_OK if any(tally.rtts_s for tally in pinger.tallies.values()) else EXIT_NO_ANSWER
+        return EXIT_NO
+    return EXIT_OK if any(tally.rtts_s for tally in pinger.tallies.values()) else EXIT_NO
 
 
 def _figures(pinger: Pinger) -> list[dict[str, Any]]:
