@@ -24,7 +24,7 @@ from plr.controlplane.core.overload.report_share import ReportShares
 from plr.controlplane.core.policy.policy import OfferRule
 from plr.controlplane.core.problem.plan import Plan
 from plr.controlplane.core.problem.problem import Problem
-from plr.controlplane.core.publish.messages import Close, CloseReason, Send
+from plr.controlplane.core.publish.messages import CloseReason, EndStream, SendMessage
 from plr.controlplane.core.registry.credential_check import check_claims, check_unproven_claims
 from plr.controlplane.core.registry.registry import Refusal
 from plr.controlplane.garbage import Collector
@@ -290,10 +290,10 @@ class ControlLoop:
     def _dispatch(self) -> None:
         while (event := self._core.next_event()) is not None:
             match event:
-                case Send(stream=stream, message=message):
+                case SendMessage(stream=stream, message=message):
                     if stream in self._mailboxes:
                         self._mailboxes[stream].put(message)
-                case Close(stream=stream, reason=reason):
+                case EndStream(stream=stream, reason=reason):
                     if stream in self._mailboxes:
                         self._mailboxes[stream].close(reason)
                 case NackNotice(sidecar=name, nack=nack):

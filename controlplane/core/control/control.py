@@ -45,7 +45,7 @@ from plr.controlplane.core.problem.plan import Plan
 from plr.controlplane.core.problem.problem import BlockKey, Problem
 from plr.controlplane.core.publish.history import MappingHistory
 from plr.controlplane.core.publish.mappings import changed_robots
-from plr.controlplane.core.publish.messages import Close, CloseReason, Send
+from plr.controlplane.core.publish.messages import CloseReason, EndStream, SendMessage
 from plr.controlplane.core.publish.publisher import Publisher
 from plr.controlplane.core.registry.registry import Admission, Refusal, Registry, StreamId
 from plr.controlplane.core.registry.restlessness import Restlessness
@@ -145,7 +145,7 @@ class ControlCore:
         self.reached = Reached()
         self.unanswered = Unanswered()
         self._publish_at: float | None = None
-        self._publications: deque[Iterator[Send | None]] = deque()
+        self._publications: deque[Iterator[SendMessage | None]] = deque()
         """Publications begun, and told to some; the first one continues first."""
         self._publishing_since = now
         self._events: deque[Event] = deque()
@@ -335,7 +335,7 @@ class ControlCore:
         welcome = Welcome(
             self.registry.lease_s, interval_s, self._settings.stun_servers, self._crl, self.pacing.reconnect_max_s
         )
-        self._events.append(Send(stream, welcome))
+        self._events.append(SendMessage(stream, welcome))
 
     def follow_load(self, now: float, busy: float | None = None) -> None:
         """Let sidecars report as often as their number and `busy` allow: the share of one core used recently.
@@ -388,7 +388,7 @@ class ControlCore:
     def _close(self, stream: StreamId | None, reason: CloseReason, now: float) -> None:
         """End a stream, if there is one; it has ended at once, not when the driver has carried that out."""
         if stream is not None:
-            self._events.append(Close(stream, reason))
+            self._events.append(EndStream(stream, reason))
             self.disconnected(stream, now)
 
     def disconnected(self, stream: StreamId, now: float) -> None:
@@ -623,7 +623,7 @@ class ControlCore:
             self._debounce.note(Change.MEMBERS, now)
         self._begin_publishing(self._publisher.publish(self.permits, self.plan, self._picture, now), now)
 
-    def _begin_publishing(self, publication: Iterator[Send | None], now: float) -> None:
+    def _begin_publishing(self, publication: Iterator[SendMessage | None], now: float) -> None:
         self._publications.append(publication)
         if len(self._publications) == 1:
             self._publishing_since = now
@@ -641,7 +641,7 @@ class ControlCore:
                 self._sent(send, now)
         self._publications.popleft()
 
-    def _sent(self, send: Send, now: float) -> None:
+    def _sent(self, send: SendMessage, now: float) -> None:
         if send.stream in self._streams:
             if isinstance(send.message, MappingSet):
                 self.history.note(self._streams[send.stream], send.message, now)
