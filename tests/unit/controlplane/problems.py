@@ -16,7 +16,7 @@ from plr.controlplane.core.problem.problem import (
     Choice,
     FleetKey,
     Objective,
-    Path,
+    PairIndex,
     Problem,
     Target,
     block_excess,
@@ -40,7 +40,7 @@ def block(
     capacity: int = 1,
     idempotent: bool = True,
     service: ServiceName = PLAN,
-    lifts: dict[tuple[Path, Path], float] | None = None,
+    lifts: dict[tuple[PairIndex, PairIndex], float] | None = None,
     copies: Copies = EVERY_INTERFACE,
     regions: tuple[str, ...] = (),
     carriers: tuple[str, ...] = (),
@@ -129,7 +129,9 @@ def fleet(rng: random.Random, robots: int, interfaces: int, servers: int, object
     return Problem(tuple(blocks), limits, objective)
 
 
-def random_lifts(rng: random.Random, epsilon: list[list[float | None]], share: float) -> dict[tuple[Path, Path], float]:
+def random_lifts(
+    rng: random.Random, epsilon: list[list[float | None]], share: float
+) -> dict[tuple[PairIndex, PairIndex], float]:
     """Lifts of a share of all pairs of paths: below 1, far above, or 0."""
     paths = [(i, j) for i, row in enumerate(epsilon) for j, value in enumerate(row) if value is not None]
     return {
