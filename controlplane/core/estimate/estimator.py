@@ -15,7 +15,7 @@ from plr.controlplane.core.estimate.composed import Asked, from_parts, parts_of,
 from plr.controlplane.core.estimate.fading import FadedCount, FadedShares, forget_after_s, forget_before
 from plr.controlplane.core.estimate.interface_trouble import InterfaceTrouble
 from plr.controlplane.core.estimate.late_fate import LateFate
-from plr.controlplane.core.estimate.network import PathView, RobotNetwork
+from plr.controlplane.core.estimate.network import ReportedPath, RobotNetwork
 from plr.controlplane.core.estimate.penalties import Penalties
 from plr.controlplane.core.estimate.posterior import IGNORANCE, Estimate, FadedTrials
 from plr.controlplane.core.estimate.processing import ComputeTimes, ServerTimes
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from plr.controlplane.core.estimate.composed import Parts
-    from plr.controlplane.core.estimate.network import PathState
+    from plr.controlplane.core.estimate.network import PathRecord
     from plr.controlplane.core.estimate.shared_fate import CommonMisses
     from plr.protos.model.ids import InterfaceName, NodeName, ServiceName
     from plr.protos.model.mapping import Assignment
@@ -313,17 +313,17 @@ class Estimator:
         if tables is not None:
             yield from (state.last for state in tables.network.paths.values())
 
-    def path_states(self, robot: NodeName) -> Mapping[tuple[InterfaceName, NodeName], PathState]:
+    def path_states(self, robot: NodeName) -> Mapping[tuple[InterfaceName, NodeName], PathRecord]:
         """Return what is known of each path of a robot: the table itself, which `forget_paths` leaves to its holder."""
         tables = self._robots.get(robot)
         return tables.network.paths if tables is not None else {}
 
-    def path_views(self, robot: NodeName) -> Iterator[PathView]:
+    def path_views(self, robot: NodeName) -> Iterator[ReportedPath]:
         """Yield each path of a robot as last reported, with its remembered round trips."""
         tables = self._robots.get(robot)
         if tables is not None:
             for key, state in tables.network.paths.items():
-                yield PathView(*key, state.up, state.rtt.median_once(), tables.network.leads_there(key))
+                yield ReportedPath(*key, state.up, state.rtt.median_once(), tables.network.leads_there(key))
 
     def path_up(self, robot: NodeName, interface: InterfaceName, server: NodeName) -> bool | None:
         """Return whether the path was up when last reported; None if it was never reported."""

@@ -92,7 +92,7 @@ class Witness(NamedTuple):
 
 
 @dataclass(frozen=True, slots=True)
-class PathView:
+class ReportedPath:
     """One path of a robot, as last reported."""
 
     interface: InterfaceName
@@ -105,7 +105,7 @@ class PathView:
 
 
 @dataclass(slots=True)
-class PathState:
+class PathRecord:
     """Everything known of one path except its requests."""
 
     up: bool
@@ -130,7 +130,7 @@ class RobotNetwork:
 
     def __init__(self, half_life_s: float) -> None:
         self._half_life_s = half_life_s
-        self.paths: OrderedDict[PathKey, PathState] = OrderedDict()
+        self.paths: OrderedDict[PathKey, PathRecord] = OrderedDict()
         self._answered_over: set[InterfaceName] = set()
         """Interfaces over which any server ever answered."""
         self._cells: OrderedDict[CellKey, FadedHistogram] = OrderedDict()
@@ -163,7 +163,9 @@ class RobotNetwork:
         if state is None:
             if not self._has_room():
                 return False
-            state = PathState(path.up, FadedHistogram(self._half_life_s, now), FadedCount(self._half_life_s, now), path)
+            state = PathRecord(
+                path.up, FadedHistogram(self._half_life_s, now), FadedCount(self._half_life_s, now), path
+            )
         self._keep(self.paths, key, state, MAX_PATHS_PER_ROBOT)
         changed = known is None or known.up != path.up
         state.up = path.up

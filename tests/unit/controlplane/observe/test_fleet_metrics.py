@@ -15,7 +15,7 @@ from plr.controlplane.cli.status_table import render
 from plr.controlplane.config.controlplane import ControlPlaneConfig
 from plr.controlplane.core.control.events import Settings
 from plr.controlplane.core.estimate.fading import FadedHistogram
-from plr.controlplane.core.estimate.network import PathView
+from plr.controlplane.core.estimate.network import ReportedPath
 from plr.controlplane.core.estimate.unanswered import LATELY_S
 from plr.controlplane.core.explain.departed import Departure
 from plr.controlplane.core.explain.fleet_view import MAX_VIEWED, InterfaceView, MemberView, MissView, ServedView
@@ -468,7 +468,7 @@ def robot_view(name: str, interfaces: int, servers: int, services: int) -> Membe
         role=Role.ROBOT,
         connected=True,
         seen_at=0.0,
-        paths=tuple(PathView(nic, cloud, True, 0.03) for nic in nics for cloud in clouds),
+        paths=tuple(ReportedPath(nic, cloud, True, 0.03) for nic in nics for cloud in clouds),
         mapping=tuple(
             ServiceMapping(service, tuple(Assignment(nic, cloud) for nic, cloud in zip(nics, clouds, strict=False)))
             for service in names
