@@ -22,7 +22,7 @@ from plr.sidecar.core.base.request_id import is_race
 from plr.sidecar.core.base.slices import in_groups
 from plr.sidecar.core.base.timers import first_of
 from plr.sidecar.core.base.values import PathState, Priority, RejectReason
-from plr.sidecar.core.cloud.executions import Waiter
+from plr.sidecar.core.cloud.executions import ReplyTo
 from plr.sidecar.core.transfer.room import Lane
 from plr.sidecar.core.transfer.waiting_line import WaitingLine
 from plr.sidecar.core.wire.messages import RejectionMessage, ResponseMessage, encode_message
@@ -72,7 +72,7 @@ class _Answer:
 
     @property
     def robot(self) -> NodeName:
-        return self.reply.waiter.path.peer
+        return self.reply.to.path.peer
 
     @property
     def request_id(self) -> RequestId:
@@ -147,11 +147,11 @@ class Answers:
             self._take(reply, now)
         for reply in replies:
             # As many as came: these, or others that have waited longer. A robot without room has none for a second one.
-            self._send_next(reply.waiter.path.peer, now)
-        self._let_go((reply.waiter.path.peer for reply in replies), now)
+            self._send_next(reply.to.path.peer, now)
+        self._let_go((reply.to.path.peer for reply in replies), now)
 
     def _take(self, reply: Reply, now: float) -> None:
-        copy, path = reply.waiter.copy, reply.waiter.path
+        copy, path = reply.to.copy, reply.to.path
         answer = self._known(path.peer, reply)
         if answer is None:
             answer = self._enter(reply, now)
@@ -196,7 +196,7 @@ class Answers:
 
     def _refusal(self, answer: _Answer, why: str) -> Reply:
         text = f"it ran, but its answer of {answer.held} bytes is not sent: {why}"
-        rejection = RejectionMessage(answer.request_id, answer.reply.waiter.copy, RejectReason.FORGOTTEN, text)
+        rejection = RejectionMessage(answer.request_id, answer.reply.to.copy, RejectReason.FORGOTTEN, text)
         # The answer's deadline may be over; the rejection is useful until `expires`, and waits behind no large answer.
         return replace(answer.reply, message=rejection, priority=Priority.HIGH, deadline=answer.reply.expires)
 
@@ -397,6 +397,6 @@ class Answers:
     def _refusals(self, answer: _Answer) -> list[Reply]:
         refusal = self._refusal(answer, "nothing of it could leave until its time was nearly over")
         return [
-            replace(refusal, waiter=Waiter(path, copy), message=replace(refusal.message, copy=copy))
+            replace(refusal, to=ReplyTo(path, copy), message=replace(refusal.message, copy=copy))
             for copy, path in {**answer.sent, **answer.waiting}.items()
         ]

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 from plr.sidecar.core.base.slices import in_groups
 from plr.sidecar.core.base.values import RejectReason
 from plr.sidecar.core.cloud.answers import Answers
-from plr.sidecar.core.cloud.executions import ExecutionTable, Reply, Waiter
+from plr.sidecar.core.cloud.executions import ExecutionTable, Reply, ReplyTo
 from plr.sidecar.core.cloud.forbidden_calls import ForbiddenCalls
 from plr.sidecar.core.rules.service_rule import MAX_LIFETIME_S, Rules
 from plr.sidecar.core.seam.application import ExecuteRequest
@@ -82,8 +82,8 @@ class Serving:
         """Take a copy of a request that arrived."""
         refusal = self._refusal(path.peer, message, now)
         if refusal and not self.executions.knows(path.peer, message.request_id):
-            waiter = Waiter(path, message.copy)
-            self.answers.send([self.executions.refuse_unseen(waiter, message, *refusal, now)], now)
+            reply_to = ReplyTo(path, message.copy)
+            self.answers.send([self.executions.refuse_unseen(reply_to, message, *refusal, now)], now)
             return
         rule = self._parts.rules.find(message.service)
         patience_s = rule.lifetime_s if rule else MAX_LIFETIME_S
