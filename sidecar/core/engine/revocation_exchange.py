@@ -16,6 +16,7 @@ from dataclasses import dataclass, field
 from itertools import islice
 from typing import TYPE_CHECKING, TypeVar
 
+from plr.sidecar.core.base.timers import NEVER
 from plr.sidecar.core.base.values import Priority
 from plr.sidecar.core.wire.messages import RevocationLists, RevocationsHeld, RevocationsWanted, encode_message
 
@@ -54,7 +55,6 @@ LIFETIME_S = 120.0
 """Lifetime of a message on its way."""
 EXCHANGES = ("asked", "sent", "received", "taken")
 """The keys of `EngineStats.revocations`."""
-NEVER = float("inf")
 
 K = TypeVar("K")
 
