@@ -101,11 +101,11 @@ def _warn_of_what_is_legal(config: ControlPlaneConfig) -> None:
 def _serve(source: Path, config: ControlPlaneConfig, files: TlsFiles | None) -> int:
     _take_descriptors()
     # Importing gRPC takes half a second; checking a configuration need not wait for that.
-    from plr.controlplane.serve.server import StartError
+    from plr.controlplane.serve.server import ListenError
 
     try:
         asyncio.run(_run(source, config, files))
-    except StartError as error:
+    except ListenError as error:
         log.critical("%s: %s", source, error)
         return EXIT_FAILED
     except Exception:

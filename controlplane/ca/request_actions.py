@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from plr.controlplane.ca.index import Record
-    from plr.controlplane.ca.request import Request
+    from plr.controlplane.ca.request import CertificateRequest
 
 _MAY = {
     IdentityRole.ROBOT: "may call services",
@@ -88,7 +88,7 @@ def _own_key(out: Path, name: str) -> ec.EllipticCurvePrivateKey:
     return key
 
 
-def _read(path: Path) -> Request:
+def _read(path: Path) -> CertificateRequest:
     try:
         pem = read_regular(path, MAX_REQUEST_BYTES + 1)
     except OSError as error:
@@ -99,7 +99,7 @@ def _read(path: Path) -> Request:
         raise AuthorityError(f"{path}: {error}; make it with: plr request") from error
 
 
-def _confirm(arguments: argparse.Namespace, asked: Request, records: Iterable[Record]) -> None:
+def _confirm(arguments: argparse.Namespace, asked: CertificateRequest, records: Iterable[Record]) -> None:
     """Return if the operator confirms this, by options or at the terminal; raises AuthorityError or ConfigError."""
     name, role, key = asked.name, asked.role.value, fingerprint(asked.key)
     for what, wanted, found in (

@@ -73,7 +73,7 @@ _SERVICES = ("", service.SERVICE_NAME, admin.SERVICE_NAME)
 """Names that the health service answers for; the first is the server as a whole."""
 
 
-class StartError(Exception):
+class ListenError(Exception):
     """An address is not available; the text names the configuration key."""
 
 
@@ -185,7 +185,7 @@ def _open_gate(config: ControlPlaneConfig, gate: TlsGate) -> str:
     try:
         return _join(host, gate.listen(host, port))
     except OSError as error:
-        raise StartError(f"listen: cannot listen on {config.listen}: {_reason(error)}") from error
+        raise ListenError(f"listen: cannot listen on {config.listen}: {_reason(error)}") from error
 
 
 async def _start_stun(
@@ -198,7 +198,7 @@ async def _start_stun(
             # "" means all addresses of both families, of which IPv6 may be missing.
             stun = await start_stun_server("" if host == "::" else host, port)
         except OSError as error:
-            raise StartError(f"stun_listen: cannot listen on {listen}: {error.strerror or error}") from error
+            raise ListenError(f"stun_listen: cannot listen on {listen}: {error.strerror or error}") from error
         cleanup.callback(stun.close)
         loop.stun_servers.append(stun)
         addresses.extend(_join(*address) for address in stun.addresses)
@@ -220,7 +220,7 @@ def _add_port(config: ControlPlaneConfig, server: grpc.aio.Server) -> str:
         socket.create_server((host, wanted), family=family).close()
         port = server.add_insecure_port(config.listen)
     except (OSError, RuntimeError) as error:
-        raise StartError(f"listen: cannot listen on {config.listen}: {_reason(error)}") from error
+        raise ListenError(f"listen: cannot listen on {config.listen}: {_reason(error)}") from error
     return _join(host, port)
 
 

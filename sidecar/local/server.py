@@ -35,7 +35,7 @@ from plr.sidecar.local.protocol import (
     encode_error,
     encode_part,
 )
-from plr.sidecar.local.shares import Rate, Rates, Shares
+from plr.sidecar.local.shares import Rate, Rates, UserShares
 
 if TYPE_CHECKING:
     import socket
@@ -80,7 +80,7 @@ ERROR_PAUSE_S = 0.1
 STOP_S = 1.0
 
 REFUSALS = ("full", "user_full", "not_allowed", "bad_request", "too_often", "too_slow", "pongs_full")
-"""The keys of `LocalServer.refused`."""
+"""The keys of `LocalSocketServer.refused`."""
 
 _TOO_MANY_PINGS = "too many pings of users other than root: wait a second"
 
@@ -95,7 +95,7 @@ class LocalSource(Protocol):
         """Return the paths to a peer, only those over `interface` if it is given."""
 
     def ping(self, path: PathId, number: int, size: int) -> None:
-        """Send a ping; `LocalServer.on_pong` gets the result."""
+        """Send a ping; `LocalSocketServer.on_pong` gets the result."""
 
 
 class LocalSocketError(Exception):
@@ -133,7 +133,7 @@ class _Client:
     """No more requests are taken from it."""
 
 
-class LocalServer:
+class LocalSocketServer:
     """Listens at `path` from `open` to `close`."""
 
     def __init__(self, path: Path, source: LocalSource) -> None:
@@ -153,9 +153,9 @@ class LocalServer:
         self._out: dict[int, tuple[_Client, int, PathId]] = {}
         """Outstanding pings by number: (client, request's id, path)."""
         now = time.monotonic()
-        self._states = Shares(STATES, now)
-        self._ping_requests = Shares(PING_REQUESTS, now)
-        self._pings: dict[str, Shares] = {}
+        self._states = UserShares(STATES, now)
+        self._ping_requests = UserShares(PING_REQUESTS, now)
+        self._pings: dict[str, UserShares] = {}
         """Shares of pings by interface."""
         self._stopping = False
         self._thread = threading.Thread(target=self._run, name="plr-local", daemon=True)
@@ -401,12 +401,12 @@ class LocalServer:
             and len(users) - users.count(None) + more <= MAX_OUT_OF_MEMBERS
         )
 
-    def _shares_of(self, interface: str, now: float) -> Shares:
+    def _shares_of(self, interface: str, now: float) -> UserShares:
         shares = self._pings.get(interface)
         if shares is None:
             if len(self._pings) >= MAX_INTERFACES:
                 del self._pings[next(iter(self._pings))]
-            shares = self._pings[interface] = Shares(PINGS, now)
+            shares = self._pings[interface] = UserShares(PINGS, now)
         return shares
 
     def _deliver_pongs(self) -> None:

@@ -60,7 +60,7 @@ _LENGTH = struct.Struct("!I")
 
 
 @dataclass(frozen=True, slots=True)
-class Identity:
+class SavedIdentity:
     """The sidecar's identity across restarts."""
 
     token: bytes = field(repr=False)
@@ -98,17 +98,17 @@ class LastGood:
                 return replace(self, mapping=message)
 
 
-def encode_identity(identity: Identity) -> bytes:
+def encode_identity(identity: SavedIdentity) -> bytes:
     """Return the file's content."""
     return _seal(_IDENTITY_MAGIC, _IDENTITY.pack(identity.token, identity.incarnation))
 
 
-def decode_identity(data: bytes) -> Identity:
+def decode_identity(data: bytes) -> SavedIdentity:
     """Read the file's content; raises DecodeError."""
     body = _open(_IDENTITY_MAGIC, data)
     if len(body) != _IDENTITY.size:
         raise DecodeError(f"identity of {len(body)} bytes, not {_IDENTITY.size}")
-    return Identity(*_IDENTITY.unpack(body))
+    return SavedIdentity(*_IDENTITY.unpack(body))
 
 
 def encode_last_good(last: LastGood) -> bytes:

@@ -23,8 +23,8 @@ from plr.protos.program.regular_file import open_regular
 from plr.sidecar.state.file import (
     MAX_FILE_BYTES,
     ControlAddresses,
-    Identity,
     LastGood,
+    SavedIdentity,
     decode_addresses,
     decode_clock_floor,
     decode_identity,
@@ -153,11 +153,11 @@ class StateStore:
             os.close(self._lock)
             self._folder.close()
 
-    def _next_identity(self) -> Identity:
+    def _next_identity(self) -> SavedIdentity:
         known = self._read(IDENTITY_FILE, decode_identity)
         # Milliseconds since 1970 make the number grow even if the last one could not be read or written.
         incarnation = max(known.incarnation + 1 if known else 1, int(time.time() * 1000.0))
-        identity = Identity(known.token if known else secrets.token_bytes(TOKEN_BYTES), incarnation)
+        identity = SavedIdentity(known.token if known else secrets.token_bytes(TOKEN_BYTES), incarnation)
         data = encode_identity(identity)
         if not self._write(IDENTITY_FILE, data):
             self._dirty[IDENTITY_FILE] = data

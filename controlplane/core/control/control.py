@@ -47,9 +47,9 @@ from plr.controlplane.core.publish.history import MappingHistory
 from plr.controlplane.core.publish.mappings import changed_robots
 from plr.controlplane.core.publish.messages import CloseReason, EndStream, SendMessage
 from plr.controlplane.core.publish.publisher import Publisher
-from plr.controlplane.core.registry.registry import Admission, Refusal, Registry, StreamId
+from plr.controlplane.core.registry.registry import AcceptedRegistration, Refusal, Registry, StreamId
 from plr.controlplane.core.registry.restlessness import Restlessness
-from plr.controlplane.core.settle.explored_pair import Exploration
+from plr.controlplane.core.settle.explored_pair import ExploredPairs
 from plr.controlplane.core.settle.stability import Stability
 from plr.protos.base.errors import DecodeError
 from plr.protos.model.fleet_events import Why
@@ -130,7 +130,7 @@ class ControlCore:
         self.history = MappingHistory()
         self.departed = Departed()
         self._returning = Returning()
-        self._exploration = Exploration()
+        self._exploration = ExploredPairs()
         warm_until = now + settings.warm_up_s if settings.warm_up_s else None
         self._publisher = Publisher(self.registry, version_epoch=version_epoch, warm_until=warm_until)
         self._streams: dict[StreamId, NodeName] = {}
@@ -157,7 +157,7 @@ class ControlCore:
         stream = StreamId(self._last_stream + 1)
         before = self.registry.get(registration.name)
         result = self.registry.register(registration, stream, now)
-        if not isinstance(result, Admission):
+        if not isinstance(result, AcceptedRegistration):
             return result
         self._last_stream = stream
         name = registration.name

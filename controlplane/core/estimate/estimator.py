@@ -16,7 +16,7 @@ from plr.controlplane.core.estimate.fading import FadedCount, FadedShares, forge
 from plr.controlplane.core.estimate.interface_trouble import InterfaceTrouble
 from plr.controlplane.core.estimate.late_fate import LateFate
 from plr.controlplane.core.estimate.network import ReportedPath, RobotNetwork
-from plr.controlplane.core.estimate.penalties import Penalties
+from plr.controlplane.core.estimate.penalties import ReportedPenalties
 from plr.controlplane.core.estimate.posterior import IGNORANCE, Estimate, FadedTrials
 from plr.controlplane.core.estimate.processing import ComputeTimes, ServerTimes
 from plr.controlplane.core.estimate.shared_fate import SharedFate
@@ -158,7 +158,7 @@ class _Robot:
         self.services: OrderedDict[ServiceName, _Service] = OrderedDict()
         self.outcomes: OrderedDict[ServiceName, _Outcomes] = OrderedDict()
         self.late: OrderedDict[ServiceName, LateFate] = OrderedDict()
-        self.penalties = Penalties()
+        self.penalties = ReportedPenalties()
         self.troubles: dict[tuple[ServiceName, float, InterfaceName], InterfaceTrouble] = {}
         """Computed, by service, deadline and interface ..."""
         self.troubles_at = (0, 0.0)

@@ -70,7 +70,7 @@ class Refusal(enum.Enum):
 
 
 @dataclass(frozen=True, slots=True)
-class Admission:
+class AcceptedRegistration:
     """An accepted registration; `replaced` is the stream that has to end for it."""
 
     replaced: StreamId | None
@@ -255,7 +255,7 @@ class Registry:
         """Return the sidecar of that name."""
         return self._sidecars.get(name)
 
-    def register(self, registration: Registration, stream: StreamId, now: float) -> Admission | Refusal:
+    def register(self, registration: Registration, stream: StreamId, now: float) -> AcceptedRegistration | Refusal:
         """Let a sidecar in, or say why not.
 
         A name belongs to the token that took it first for as long as its lease lasts, and within a token to the newest
@@ -275,7 +275,7 @@ class Registry:
             self._leases[name] = _Lease(self.lease_s, now + self.lease_s, now)
             self._sessions[registration.session] = name
             self._await_end(name)
-            return Admission(replaced=None, new_run=True)
+            return AcceptedRegistration(replaced=None, new_run=True)
         before = known.registration
         if registration.token != before.token:
             return self._refuse(Refusal.NAME_TAKEN)
@@ -292,7 +292,7 @@ class Registry:
         del self._sessions[before.session]
         self._sessions[registration.session] = name
         self._leases[name] = _Lease(self.lease_s, now + self.lease_s, now)
-        return Admission(replaced=known.stream, new_run=not same_run)
+        return AcceptedRegistration(replaced=known.stream, new_run=not same_run)
 
     def remove(self, name: NodeName, reason: RemovalReason) -> Sidecar | None:
         """Remove it, whatever its lease; return it as it was, or None if it was not there."""

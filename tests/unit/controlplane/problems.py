@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 from plr.controlplane.core.problem.costs import RULE_PRICE, TIE_PRICE
 from plr.controlplane.core.problem.objectives import PROBABILITY_FLOOR
-from plr.controlplane.core.problem.plan import Price
+from plr.controlplane.core.problem.plan import PlanCost
 from plr.controlplane.core.problem.problem import (
     Block,
     BlockKey,
@@ -219,19 +219,19 @@ def plain_objective(objective: Objective, part: Block, choice: Choice) -> float:
             return math.log(all_miss(part, choice))
 
 
-def best_price(problem: Problem) -> Price:
+def best_price(problem: Problem) -> PlanCost:
     """The least price of all valid choices."""
     options = [
         [(choice, plain_cost(problem.objective, part, choice)) for choice in valid_choices(part)]
         for part in problem.blocks
     ]
-    best = Price(10**9, 0.0)
+    best = PlanCost(10**9, 0.0)
     for combination in itertools.product(*options):
         chosen = {part.key: choice for part, (choice, _) in zip(problem.blocks, combination, strict=True)}
         excess = sum(block_excess(part, chosen[part.key]) for part in problem.blocks)
         if excess <= best.excess:
             excess += sum(fleet_excess(problem, chosen).values())
-            best = min(best, Price(excess, sum(cost for _, cost in combination)))
+            best = min(best, PlanCost(excess, sum(cost for _, cost in combination)))
     return best
 
 
