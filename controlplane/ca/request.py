@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 
 REQUEST_FILE = "request.pem"
 
-MAX_REQUEST_BYTES = 4096
+MAX_CERTIFICATE_REQUEST_BYTES = 4096
 """Longest request, PEM: `plr request` writes some 420 bytes."""
 
 _EXTENSION_REQUEST = "1.2.840.113549.1.9.14"
@@ -64,8 +64,8 @@ def build_request(name: str, role: IdentityRole, key: ec.EllipticCurvePrivateKey
 
 def parse_request(pem: bytes) -> CertificateRequest:
     """Return the parsed request; raises DecodeError, whose text is fit for a terminal."""
-    if len(pem) > MAX_REQUEST_BYTES:
-        raise DecodeError(f"the request is longer than {MAX_REQUEST_BYTES} bytes")
+    if len(pem) > MAX_CERTIFICATE_REQUEST_BYTES:
+        raise DecodeError(f"the request is longer than {MAX_CERTIFICATE_REQUEST_BYTES} bytes")
     try:
         return _checked(x509.load_pem_x509_csr(pem))
     except DecodeError:

@@ -15,7 +15,13 @@ from plr.controlplane.ca.certificates import generate_key
 from plr.controlplane.ca.files import PRIVATE_FILE, PUBLIC_FILE, make_private, write_atomically, write_certificate
 from plr.controlplane.ca.folder import AuthorityFolder
 from plr.controlplane.ca.key_file import clear_pem
-from plr.controlplane.ca.request import MAX_REQUEST_BYTES, REQUEST_FILE, build_request, fingerprint, parse_request
+from plr.controlplane.ca.request import (
+    MAX_CERTIFICATE_REQUEST_BYTES,
+    REQUEST_FILE,
+    build_request,
+    fingerprint,
+    parse_request,
+)
 from plr.protos.base.errors import ConfigError, DecodeError
 from plr.protos.base.printable import escaped
 from plr.protos.program.regular_file import read_regular
@@ -90,7 +96,7 @@ def _own_key(out: Path, name: str) -> ec.EllipticCurvePrivateKey:
 
 def _read(path: Path) -> CertificateRequest:
     try:
-        pem = read_regular(path, MAX_REQUEST_BYTES + 1)
+        pem = read_regular(path, MAX_CERTIFICATE_REQUEST_BYTES + 1)
     except OSError as error:
         raise AuthorityError(f"{path}: cannot be read: {error.strerror or error}") from error
     try:

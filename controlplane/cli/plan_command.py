@@ -28,10 +28,10 @@ if TYPE_CHECKING:
     from plr.protos.program.arguments import Commands
 
 
-MAX_REQUESTS = 5_000_000
+MAX_REPLAYED_REQUESTS = 5_000_000
 """Most requests sent through traces in one run: some minutes."""
 
-MAX_MESSAGE_BYTES = 1 << 24
+MAX_REQUEST_OR_ANSWER_BYTES = 1 << 24
 
 _EPILOG = """\
 The LSC theorem says that one server behind one path can not be latency-reliable on commodity infrastructure: it misses
@@ -73,7 +73,7 @@ def add_to(commands: Commands, summary: str) -> None:
     plan.add_argument("--plot", type=Path, metavar="FILE", help="draw it over the deadline: .svg or .html")
     plan.add_argument("--json", action="store_true", help="print the table as JSON")
     workload = plan.add_argument_group("what is sent through traces")
-    size = whole(1, MAX_MESSAGE_BYTES)
+    size = whole(1, MAX_REQUEST_OR_ANSWER_BYTES)
     workload.add_argument("--request-bytes", type=size, metavar="N", help=f"the default is {DEFAULT.request_bytes}")
     workload.add_argument("--answer-bytes", type=size, metavar="N", help=f"the default is {DEFAULT.answer_bytes}")
     workload.add_argument(
@@ -171,8 +171,10 @@ def _replayed(arguments: argparse.Namespace) -> tuple[Source, float]:
     workload = replace(DEFAULT, **_given(arguments))
     traces = _read(arguments.traces)
     requests = sum(trace.duration_s for trace in traces) * workload.rate_hz
-    if requests > MAX_REQUESTS:
-        raise _UsageError(f"{requests:.0f} requests, {MAX_REQUESTS} at most: give fewer traces or a lower --rate-hz")
+    if requests > MAX_REPLAYED_REQUESTS:
+        raise _UsageError(
+            f"{requests:.0f} requests, {MAX_REPLAYED_REQUESTS} at most: give fewer traces or a lower --rate-hz"
+        )
     if requests < 1.0:
         raise _UsageError("the traces are too short for a single request")
     return ReplayedTraces(traces, workload), arguments.deadline_ms / 1e3

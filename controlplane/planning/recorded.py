@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 MAX_CHOICES = 20_000
 """Most sets examined; if there are more, only the servers with the least epsilon of each interface are used."""
 
-MAX_PROBES = 100.0
+MAX_COUNTED_PROBES = 100.0
 """Beyond this many, probes no longer move a probability closer to 0 or 1: they are small."""
 
 MIN_REQUESTS = 20.0
@@ -139,7 +139,7 @@ class RecordedService:
             return pair.miss.mean
         network, later_s = self._network(pair)
         over = network.sum_exceeds(_distribution(pair.compute), deadline_s - later_s)
-        samples = pair.network.total / SAMPLE or min(pair.probes, MAX_PROBES)
+        samples = pair.network.total / SAMPLE or min(pair.probes, MAX_COUNTED_PROBES)
         return (over * samples + IGNORANCE.misses) / (samples + IGNORANCE.weight)
 
     def _network(self, pair: PairExplanation) -> tuple[Distribution, float]:

@@ -22,7 +22,7 @@ from plr.controlplane.observe.metrics import Metrics
 from plr.controlplane.serve import admin, service
 from plr.controlplane.serve.access import AccessGuard
 from plr.controlplane.serve.certificate_watch import CertificateKeeper
-from plr.controlplane.serve.stream_limits import MAX_MESSAGE_BYTES, MAX_STREAMS_PER_CONNECTION
+from plr.controlplane.serve.stream_limits import MAX_STREAM_MESSAGE_BYTES, MAX_STREAMS_PER_CONNECTION
 from plr.controlplane.serve.stun_server import start_stun_server
 from plr.controlplane.serve.tls_gate import TlsGate
 from plr.protos.base.host_port import split_host_port
@@ -53,7 +53,7 @@ GRPC_OPTIONS: tuple[tuple[str, int], ...] = (
     # Our pings find connections that died silently; the lease has removed their sidecar by then.
     ("grpc.keepalive_time_ms", 20_000),
     ("grpc.keepalive_timeout_ms", 10_000),
-    ("grpc.max_receive_message_length", MAX_MESSAGE_BYTES),
+    ("grpc.max_receive_message_length", MAX_STREAM_MESSAGE_BYTES),
     ("grpc.max_concurrent_streams", MAX_STREAMS_PER_CONNECTION),
     # A connection without a call keeps its place for as long as somebody reads the answer to the previous call.
     ("grpc.max_connection_idle_ms", 60_000),

@@ -46,7 +46,7 @@ MAX_LISTED_SIDECARS = 8192
 MAX_DURATION_S = 86_400.0
 """Longest deadline, lease or interval: one day. Anything longer is a unit mistake."""
 
-MAX_EVENTS = 1 << 53
+MAX_REPORTED_COUNT = 1 << 53
 """Largest count of datagrams or requests in one report: the largest that a float holds exactly."""
 
 MAX_CAPACITY = 1_000_000

@@ -49,7 +49,7 @@ MAX_INTERFACE_CHARACTERS = 15
 """Linux's limit."""
 MAX_PINGED_PATHS = 4096
 """Paths to one peer; more are not counted."""
-MAX_WAITING = 128
+MAX_AWAITED_TURNS = 128
 """Turns whose answers are awaited."""
 
 
@@ -147,7 +147,7 @@ class Pinger:
         tally = self.tallies.setdefault(key, PathTally())
         if turn and turn not in tally.waiting:
             tally.asked += 1
-            tally.waiting = {one for one in tally.waiting if one > turn - MAX_WAITING} | {turn}
+            tally.waiting = {one for one in tally.waiting if one > turn - MAX_AWAITED_TURNS} | {turn}
 
     def _pong(self, turn: int, pong: dict[str, Any]) -> None:
         key = pong["interface"], pong["remote"]

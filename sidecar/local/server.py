@@ -26,8 +26,8 @@ from plr.sidecar.core.link.pinging import Pong
 from plr.sidecar.local.entrance import Entrance, SocketLock, for_group
 from plr.sidecar.local.peer import groups_of, user_of
 from plr.sidecar.local.protocol import (
-    MAX_REQUEST_BYTES,
-    MAX_REQUESTS,
+    MAX_REQUEST_LINE_BYTES,
+    MAX_REQUESTS_OF_CONNECTION,
     PingRequest,
     StateRequest,
     decode_request,
@@ -50,7 +50,7 @@ GROUP = "plr"
 """Group whose members may ask, besides root and the sidecar's own user."""
 MAX_OWN = 8
 """Most connections of root and the sidecar's own user."""
-MAX_MEMBERS = 16
+MAX_MEMBER_CONNECTIONS = 16
 """Most connections of all others together ..."""
 MAX_OF_A_USER = 4
 """... and of each of them."""
@@ -64,9 +64,9 @@ STATES = Rates(owner=Rate(4.0, 8.0), members=Rate(2.0, 8.0), member=Rate(1.0, 4.
 PING_REQUESTS = Rates(owner=Rate(50.0, 100.0), members=Rate(40.0, 80.0), member=Rate(20.0, 40.0))
 PINGS = Rates(owner=Rate(50.0, 100.0), members=Rate(10.0, 30.0), member=Rate(5.0, 15.0))
 """Pings over each interface, which sends few (`sidecar/core/link/pinging.py`): members leave half of them to root."""
-MAX_INTERFACES = 64
+MAX_PINGED_INTERFACES = 64
 """Interfaces whose requested pings are remembered."""
-MAX_PINGS_OUT = 256
+MAX_REQUESTED_PINGS = 256
 MAX_OUT_OF_MEMBERS, MAX_OUT_OF_A_USER = 192, 64
 PONG_WAIT_S = 10.0
 """Time within which a ping is answered, or not at all: a round trip of 10 s is the longest that has to work."""
@@ -179,7 +179,7 @@ class LocalSocketServer:
 
     def on_pong(self, pong: Pong) -> None:
         """Take the result of a ping; from any thread, which does not wait."""
-        if len(self._pongs) >= 2 * MAX_PINGS_OUT:
+        if len(self._pongs) >= 2 * MAX_REQUESTED_PINGS:
             self.refused["pongs_full"] += 1
             return
         self._pongs.append(pong)
@@ -283,7 +283,7 @@ class LocalSocketServer:
             return "not_allowed", f"only root and members of the group {GROUP} may ask"
         if others.count(user) >= MAX_OF_A_USER:
             return "user_full", "too many of this user ask at once: try again"
-        if len(others) - others.count(None) >= MAX_MEMBERS:
+        if len(others) - others.count(None) >= MAX_MEMBER_CONNECTIONS:
             return "full", "too many ask at once: try again"
         return None
 
@@ -304,7 +304,7 @@ class LocalSocketServer:
 
     def _read(self, client: _Client) -> None:
         try:
-            data = client.sock.recv(MAX_REQUEST_BYTES)
+            data = client.sock.recv(MAX_REQUEST_LINE_BYTES)
         except BlockingIOError:  # the event belonged to an earlier connection with the same number
             return
         if not data and _is_gone(client.sock):
@@ -321,8 +321,8 @@ class LocalSocketServer:
             self._take(client, line)
         if client.closing or client.rests_until:
             return
-        if len(client.received) > MAX_REQUEST_BYTES:
-            self._refuse_for_good(client, f"a request is a line of at most {MAX_REQUEST_BYTES} bytes")
+        if len(client.received) > MAX_REQUEST_LINE_BYTES:
+            self._refuse_for_good(client, f"a request is a line of at most {MAX_REQUEST_LINE_BYTES} bytes")
         elif client.ended:
             client.closing = True
             if client.received:
@@ -338,7 +338,7 @@ class LocalSocketServer:
             self._refuse_for_good(client, str(error))
             return
         now = time.monotonic()
-        if len(client.answers) + len(client.rounds) >= MAX_REQUESTS or request.id in client.rounds:
+        if len(client.answers) + len(client.rounds) >= MAX_REQUESTS_OF_CONNECTION or request.id in client.rounds:
             self._too_often(client, request.id)
         elif isinstance(request, StateRequest):
             if self._states.take(client.user, now):
@@ -394,7 +394,7 @@ class LocalSocketServer:
 
     def _may_be_out(self, user: int | None, more: int) -> bool:
         users = [client.user for client, _, _ in self._out.values()]
-        if len(users) + more > MAX_PINGS_OUT:
+        if len(users) + more > MAX_REQUESTED_PINGS:
             return False
         return user is None or (
             users.count(user) + more <= MAX_OUT_OF_A_USER
@@ -404,7 +404,7 @@ class LocalSocketServer:
     def _shares_of(self, interface: str, now: float) -> UserShares:
         shares = self._pings.get(interface)
         if shares is None:
-            if len(self._pings) >= MAX_INTERFACES:
+            if len(self._pings) >= MAX_PINGED_INTERFACES:
                 del self._pings[next(iter(self._pings))]
             shares = self._pings[interface] = UserShares(PINGS, now)
         return shares

@@ -44,7 +44,7 @@ FORMAT_VERSION = 1
 LAST_GOOD_VERSION = 2
 """Since version 2 the tokens of peers are specific to this sidecar, and their addresses are signed."""
 
-MAX_FILE_BYTES = 64 << 20
+MAX_STATE_FILE_BYTES = 64 << 20
 """Well above the largest peer set and mapping that the control stream can carry."""
 
 _IDENTITY_MAGIC = b"plr-id\0\0"

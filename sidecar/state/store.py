@@ -21,7 +21,7 @@ from plr.protos.model.members import TOKEN_BYTES
 from plr.protos.program.own_folder import OwnFolder
 from plr.protos.program.regular_file import open_regular
 from plr.sidecar.state.file import (
-    MAX_FILE_BYTES,
+    MAX_STATE_FILE_BYTES,
     ControlAddresses,
     LastGood,
     SavedIdentity,
@@ -187,9 +187,9 @@ class StateStore:
         path = self._folder.path / name
         try:
             with self._folder.open_to_read(name) as file:
-                data = file.read(MAX_FILE_BYTES + 1)
-            if len(data) > MAX_FILE_BYTES:
-                raise DecodeError(f"more than {MAX_FILE_BYTES} bytes")
+                data = file.read(MAX_STATE_FILE_BYTES + 1)
+            if len(data) > MAX_STATE_FILE_BYTES:
+                raise DecodeError(f"more than {MAX_STATE_FILE_BYTES} bytes")
             return decode(data)
         except FileNotFoundError:
             return None
@@ -228,7 +228,7 @@ def peek_last_good(folder: Path, owner: NodeName) -> LastGood:
     """
     try:
         with open_regular(folder / LAST_GOOD_FILE) as file:
-            data = file.read(MAX_FILE_BYTES + 1)
+            data = file.read(MAX_STATE_FILE_BYTES + 1)
         return decode_last_good(data, owner)
     except (OSError, DecodeError):
         return LastGood(owner)

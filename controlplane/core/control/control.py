@@ -34,7 +34,7 @@ from plr.controlplane.core.explain.fleet_view import MemberView, view_of
 from plr.controlplane.core.explain.returning import Returning
 from plr.controlplane.core.explain.status import is_met, is_offered, statuses
 from plr.controlplane.core.formulation.block import Picture
-from plr.controlplane.core.formulation.problem_builder import MAX_INTERFACES, Drawing
+from plr.controlplane.core.formulation.problem_builder import MAX_CONSIDERED_INTERFACES, Drawing
 from plr.controlplane.core.overload.pacing import Pacing
 from plr.controlplane.core.overload.urgency import Urgency
 from plr.controlplane.core.policy.cut_off import cut_off
@@ -246,7 +246,7 @@ class ControlCore:
             changed = self.registry.set_candidates(name, told)
             if changed:
                 interfaces = len({candidate.interface for candidate in told.candidates})
-                self.counters.interfaces_left_out += max(0, interfaces - MAX_INTERFACES)
+                self.counters.interfaces_left_out += max(0, interfaces - MAX_CONSIDERED_INTERFACES)
         else:
             known = self.registry.get(name)
             if told.unmet and known is not None and told.unmet != known.unmet:

@@ -77,7 +77,7 @@ MAX_HISTOGRAMS = 131_072
 have not reported for `LIVE_S` are forgotten, the longest silent first. If there are none, robots that have their equal
 share get no new ones. So no robot that reports loses what another one brings."""
 
-MAX_ROBOTS = 8192
+MAX_ESTIMATED_ROBOTS = 8192
 """Robots kept, including some that left: twice as many as may be registered."""
 
 LIVE_S = 60.0
@@ -249,7 +249,7 @@ class Estimator:
 
     def _forget_silent(self, robot: NodeName, now: float) -> None:
         """Make room for this robot's report by forgetting robots that have been silent for long, if any."""
-        while self._histograms >= MAX_HISTOGRAMS or len(self._robots) > MAX_ROBOTS:
+        while self._histograms >= MAX_HISTOGRAMS or len(self._robots) > MAX_ESTIMATED_ROBOTS:
             name, silent = next(iter(self._robots.items()))
             if name == robot or now - silent.heard_at < LIVE_S:
                 return

@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 StreamId = NewType("StreamId", int)
 """Number of one stream, unique in one run of the control plane."""
 
-MAX_OFFERED = 1024
+MAX_REMEMBERED_OFFERS = 1024
 """Service names remembered for one cloud, as many as it may offer at once. Beyond that, only its present offers."""
 
 MAX_REMEMBERED_REMOVALS = 4096
@@ -90,9 +90,9 @@ class Sidecar:
     """None until announced."""
     draining: bool = False
     offered: frozenset[ServiceName] = frozenset()
-    """Services it has offered since it registered, at most MAX_OFFERED."""
+    """Services it has offered since it registered, at most MAX_REMEMBERED_OFFERS."""
     carried: frozenset[ServiceName] = frozenset()
-    """Services it has carried in this run since it registered, at most MAX_OFFERED."""
+    """Services it has carried in this run since it registered, at most MAX_REMEMBERED_OFFERS."""
     labels: tuple[InterfaceLabel, ...] = ()
     """What a robot says of its interfaces."""
     down: tuple[InterfaceLabel, ...] = ()
@@ -168,8 +168,8 @@ class Sidecar:
         return replace(
             self,
             services=told,
-            offered=offered if len(offered) <= MAX_OFFERED else now_offered,
-            carried=carried if len(carried) <= MAX_OFFERED else now_carried,
+            offered=offered if len(offered) <= MAX_REMEMBERED_OFFERS else now_offered,
+            carried=carried if len(carried) <= MAX_REMEMBERED_OFFERS else now_carried,
         )
 
     @property

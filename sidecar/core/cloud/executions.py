@@ -45,7 +45,7 @@ MAX_WAITERS = 16
 """Most copies that wait for one result; a robot sends one for each of its interfaces."""
 MAX_CACHED_BYTES = 64 * 1024 * 1024
 """Bytes of answers kept for late copies; beyond that the robot that holds the most loses its oldest."""
-MAX_REMEMBERED = 262_144
+MAX_REMEMBERED_IDS = 262_144
 """Ids remembered; one robot may fill half: 2000 requests a second for MIN_REMEMBER_S."""
 REMEMBER_LIFETIMES = 2.0
 """An id is remembered after the answer for this many lifetimes of its request ..."""
@@ -138,7 +138,7 @@ class ExecutionTable:
         self._running: dict[ExecutionId, _Execution] = {}
         self._running_shares = Shares(MAX_RUNNING)
         self._running_bytes = Shares(MAX_RUNNING_BYTES)
-        self._finished_shares = Shares(MAX_REMEMBERED)
+        self._finished_shares = Shares(MAX_REMEMBERED_IDS)
         self._cache = AnswerCache(MAX_CACHED_BYTES)
         self._timers: list[tuple[float, ExecutionId]] = []
         self._next_id = 0

@@ -10,7 +10,7 @@ if TYPE_CHECKING:
     from plr.sidecar.core.base.values import PathId, PathState
     from plr.sidecar.core.seam.links import PathChanged
 
-MAX_REMEMBERED = 4096
+MAX_CHANGED_PATHS = 4096
 """Paths remembered per interface, those of departed peers included. Beyond it the one that changed longest ago goes."""
 
 
@@ -38,7 +38,7 @@ class PathHistory:
             return
         self._last.pop(event.path, None)
         self._last[event.path] = LivenessChange(event.state, now, event.reason)
-        if len(self._last) > MAX_REMEMBERED:
+        if len(self._last) > MAX_CHANGED_PATHS:
             del self._last[next(iter(self._last))]
             self._drops["path_history_full"] += 1
 

@@ -46,7 +46,7 @@ RETRY_S = 0.05
 MAX_RETRY_S = 2.0
 """... and after no more than this for the first MAX_COPIES_OF_REQUEST. Then the time doubles again, so that a server
 that takes minutes to start is still asked before the request's lifetime ends, and few bytes travel in vain."""
-MAX_HELD_BYTES = 256 * 1024 * 1024
+MAX_REQUEST_TABLE_BYTES = 256 * 1024 * 1024
 """Most payload bytes held. A payload is held until its request's last copy has ended, also while the request waits for
 a path or for room."""
 TIMER_SLACK = 1024
@@ -119,7 +119,7 @@ class RequestTable:
             return f"the service's name or type is longer than {MAX_NAME_BYTES} bytes"
         if self.unanswered >= MAX_IN_FLIGHT:
             return f"{MAX_IN_FLIGHT} requests are in flight already"
-        if self._held_bytes + size > MAX_HELD_BYTES:
+        if self._held_bytes + size > MAX_REQUEST_TABLE_BYTES:
             return f"the requests in flight have {self._held_bytes} bytes already"
         if request.id in self._requests:
             return "a request with this identity is in flight already"

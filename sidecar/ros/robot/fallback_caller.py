@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from plr.sidecar.ros.ros_loop import RosLoop
     from plr.sidecar.ros.stats import BridgeStats
 
-MAX_ASKED = 64
+MAX_ASKED_OF_FALLBACK = 64
 """Requests whose number at one fallback is remembered; beyond this the oldest, lost long ago, is forgotten."""
 COMPLAIN_AFTER_S = 5.0
 """How long a fallback may be missing before that is logged: the robot's nodes start together."""
@@ -68,7 +68,7 @@ class Fallback:
         """Send a request. Raises RosBridgeError."""
         number = self.server.send(self.server.type.request.deserialize(call.payload))
         self._asked[number] = call.request_id
-        if len(self._asked) > MAX_ASKED:
+        if len(self._asked) > MAX_ASKED_OF_FALLBACK:
             del self._asked[next(iter(self._asked))]
 
     def take(self) -> Iterator[tuple[RequestId | None, bytes]]:

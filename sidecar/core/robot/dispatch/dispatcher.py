@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
 MAX_COPIES_OF_REQUEST = 8
 """Most copies of one request, including those sent in trouble."""
-MAX_ASKED = 16
+MAX_COPIES_WHILE_REFUSED = 16
 """The same while it is certain that no server ran any of them, and each was given time to become ready."""
 
 
@@ -281,4 +281,4 @@ class Dispatching:
 
 def _most_copies(request: Request) -> int:
     patient = request.retry_at is None and request.certainly_not_run()
-    return MAX_ASKED if patient else MAX_COPIES_OF_REQUEST
+    return MAX_COPIES_WHILE_REFUSED if patient else MAX_COPIES_OF_REQUEST

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 MAX_WANTED = 64
 """Most requests that wait for one fallback; a longer queue helps nobody."""
-MAX_HELD_BYTES = 256 * 1024 * 1024
+MAX_FALLBACK_BYTES = 256 * 1024 * 1024
 """Most payload bytes kept for fallbacks, as many as for the network: it may give up before the fallbacks do."""
 MAX_ATTEMPTS = 4
 """Most times that a fallback is asked one request. A request lost with a fallback is asked again, as the fallback may
@@ -114,7 +114,7 @@ class Fallbacks:
         queue = self._queues.get(service)
         if queue is None:
             return
-        if self._held_bytes + len(payload) > MAX_HELD_BYTES:
+        if self._held_bytes + len(payload) > MAX_FALLBACK_BYTES:
             self._outcomes[service, "overloaded"] += 1
             return
         request = FallbackRequest(request_id, payload, now + queue.deadline_s, now + queue.lifetime_s)

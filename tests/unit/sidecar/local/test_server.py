@@ -18,7 +18,7 @@ import pytest
 from plr.sidecar.local import server as server_module
 from plr.sidecar.local.client import LocalClient, LocalError
 from plr.sidecar.local.entrance import for_group
-from plr.sidecar.local.server import MAX_OWN, MAX_PINGS_OUT, STATES, LocalSocketError, LocalSocketServer
+from plr.sidecar.local.server import MAX_OWN, MAX_REQUESTED_PINGS, STATES, LocalSocketError, LocalSocketServer
 from tests.unit.sidecar.local.world import NOBODY, PATIENCE_S, ROOT, Source, raw, reachable, wait_until
 
 if TYPE_CHECKING:
@@ -281,7 +281,7 @@ def test_pings_that_are_out_are_bounded_and_forgotten(server: LocalSocketServer,
         asked = [{"id": number, "ask": "ping", "peer": "cloud-1", "size": 64} for number in range(200)]
         greedy.sendall(b"".join(json.dumps(one).encode() + b"\n" for one in asked))
         wait_until(lambda: server.refused["too_often"] > 0)
-        assert len(server._out) <= MAX_PINGS_OUT
+        assert len(server._out) <= MAX_REQUESTED_PINGS
     wait_until(lambda: not server._clients)
     assert not server._out
 

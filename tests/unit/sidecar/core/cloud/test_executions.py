@@ -284,7 +284,7 @@ def test_a_full_table_refuses_one_robot_and_still_serves_another() -> None:
 
 
 def test_remembered_ids_are_capped_per_robot(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(dedup, "MAX_REMEMBERED", 20)
+    monkeypatch.setattr(dedup, "MAX_REMEMBERED_IDS", 20)
     executions = table()
     for number in range(10):
         executions.complete(run(executions, request(number)).execution, b"", 0.0, 1.0)

@@ -6,7 +6,7 @@ from plr.protos.model.ids import NodeName, ServiceName
 from plr.protos.model.members import ServiceOffer
 from plr.sidecar.core.base.slices import Backlog
 from plr.sidecar.core.base.values import PathState, RejectReason
-from plr.sidecar.core.cloud.forbidden_calls import MAX_ROBOTS, TELL_EVERY_S, ForbiddenCalls
+from plr.sidecar.core.cloud.forbidden_calls import MAX_FORBIDDEN_ROBOTS, TELL_EVERY_S, ForbiddenCalls
 from plr.sidecar.core.cloud.serving import Serving, ServingParts
 from plr.sidecar.core.rules.service_rule import Rules
 from plr.sidecar.core.seam.application import ApplicationEvent, CallsForbidden, ExecuteRequest
@@ -131,6 +131,6 @@ def test_notices_are_rare_and_count_what_was_not_told() -> None:
 
 def test_the_robots_noted_are_bounded() -> None:
     forbidden = ForbiddenCalls()
-    for number in range(2 * MAX_ROBOTS):
+    for number in range(2 * MAX_FORBIDDEN_ROBOTS):
         forbidden.note(NodeName(f"r{number}"), ECHO, 1.0)
-    assert len(forbidden._robots) == MAX_ROBOTS
+    assert len(forbidden._robots) == MAX_FORBIDDEN_ROBOTS

@@ -8,7 +8,7 @@ from plr.sidecar.core.message.repair import MAX_DOUBLED_SYMBOLS
 from plr.sidecar.core.seam.links import FragmentsLost, LinkCommand, Resend, Send, SendAbandon
 from plr.sidecar.core.seam.stats import EngineStats
 from plr.sidecar.core.transfer.outbox import MAX_GENERATIONS, Outbox
-from plr.sidecar.core.transfer.room import LARGE_ROOM_BYTES, MAX_MESSAGES, SMALL_BYTES, SMALL_ROOM_BYTES
+from plr.sidecar.core.transfer.room import LARGE_ROOM_BYTES, MAX_UNDELIVERED_MESSAGES, SMALL_BYTES, SMALL_ROOM_BYTES
 from plr.sidecar.core.transfer.routes import Routes
 from plr.sidecar.core.wire.frame import BASE_BYTES
 from plr.sidecar.core.wire.messages import Encoded
@@ -268,7 +268,7 @@ def test_the_box_is_capped_and_a_greedy_peer_does_not_lock_others_out() -> None:
     taken = 0
     while box.outbox.send(OVER_WLAN, SMALL, priority=Priority.NORMAL, deadline=1.0, expires=10.0) is not None:
         taken += 1
-    assert taken == MAX_MESSAGES // 2
+    assert taken == MAX_UNDELIVERED_MESSAGES // 2
     assert box.stats.dropped["outbox_full"] == 1
     assert box.outbox.has_room(B, 1000)
 
