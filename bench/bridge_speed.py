@@ -177,7 +177,7 @@ class Shortcut:
     def judge_answer(self, request_id: RequestId, copy: int, problem: str | None) -> None:
         assert problem is None
 
-    def answered_here(self, request_id: RequestId) -> None:
+    def answered_locally(self, request_id: RequestId) -> None:
         raise AssertionError("nothing has a fallback here")
 
     def complete(self, execution: ExecutionId, payload: bytes, processing_s: float) -> None:

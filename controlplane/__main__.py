@@ -22,6 +22,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from plr.protos.program import endings, extras, interpreter
+from plr.protos.program.exit_codes import EXIT_FAILED, EXIT_OK, EXIT_USAGE
 
 with extras.required("plr-controlplane", "controlplane"):
     from plr.controlplane.config.controlplane import load_config, refuse_exposed
@@ -41,9 +42,6 @@ if TYPE_CHECKING:
     from plr.controlplane.serve.server import Addresses
     from plr.protos.program.tls_files import TlsFiles
 
-EXIT_OK = 0
-EXIT_FAILED = 1
-EXIT_USAGE = 2
 
 _NO_STUN_SERVERS = (
     "stun_servers is empty: sidecars get no STUN server, and robots behind a NAT stay unreachable unless their own "
@@ -103,11 +101,11 @@ def _warn_of_what_is_legal(config: ControlPlaneConfig) -> None:
 def _serve(source: Path, config: ControlPlaneConfig, files: TlsFiles | None) -> int:
     _take_descriptors()
     # Importing gRPC takes half a second; checking a configuration need not wait for that.
-    from plr.controlplane.serve.server import StartError
+    from plr.controlplane.serve.server import ListenError
 
     try:
         asyncio.run(_run(source, config, files))
-    except StartError as error:
+    except ListenError as error:
         log.critical("%s: %s", source, error)
         return EXIT_FAILED
     except Exception:

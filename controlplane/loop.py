@@ -24,11 +24,11 @@ from plr.controlplane.core.overload.report_share import ReportShares
 from plr.controlplane.core.policy.policy import OfferRule
 from plr.controlplane.core.problem.plan import Plan
 from plr.controlplane.core.problem.problem import Problem
-from plr.controlplane.core.publish.messages import Close, CloseReason, Send
+from plr.controlplane.core.publish.messages import CloseReason, EndStream, SendMessage
 from plr.controlplane.core.registry.credential_check import check_claims, check_unproven_claims
 from plr.controlplane.core.registry.registry import Refusal
 from plr.controlplane.garbage import Collector
-from plr.controlplane.observe.fleet_metrics import MAX_GONE, Fleet
+from plr.controlplane.observe.fleet_metrics import MAX_GONE_WITH_SERIES, Fleet
 from plr.controlplane.observe.remembered import departures
 from plr.controlplane.serve.earliest_end import EarliestEnd
 from plr.controlplane.serve.mailbox import Mailbox
@@ -269,7 +269,7 @@ class ControlLoop:
         members = [view for view in views if view is not None]
         ends = {name: caller.identity.not_after for name, caller in self._callers.items()}
         now = self._loop.time()
-        return Fleet(members, self._core.departed.told(now, MAX_GONE), ends, now, time.time())
+        return Fleet(members, self._core.departed.told(now, MAX_GONE_WITH_SERIES), ends, now, time.time())
 
     def status_line(self) -> str:
         """Return the state in a few words, for `systemctl status`."""
@@ -290,10 +290,10 @@ class ControlLoop:
     def _dispatch(self) -> None:
         while (event := self._core.next_event()) is not None:
             match event:
-                case Send(stream=stream, message=message):
+                case SendMessage(stream=stream, message=message):
                     if stream in self._mailboxes:
                         self._mailboxes[stream].put(message)
-                case Close(stream=stream, reason=reason):
+                case EndStream(stream=stream, reason=reason):
                     if stream in self._mailboxes:
                         self._mailboxes[stream].close(reason)
                 case NackNotice(sidecar=name, nack=nack):

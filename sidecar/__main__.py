@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from plr.protos.program import commit, endings, extras
+from plr.protos.program.exit_codes import EXIT_FAILED, EXIT_OK, EXIT_USAGE
 
 with extras.required("plr-sidecar", "sidecar"):
     from plr.protos.base.errors import ConfigError, StartError
@@ -39,9 +40,6 @@ if TYPE_CHECKING:
 log = logging.getLogger("plr.sidecar.main")
 
 PROGRAM = "plr-sidecar"
-EXIT_OK = 0
-EXIT_FAILURE = 1
-EXIT_BAD_CONFIG = 2
 
 SHORT_DEADLINE_MS = 1.0
 """A deadline below this was probably meant in seconds."""
@@ -76,7 +74,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     lacking = extras.missing("sidecar", extras.SIDECAR)
     if lacking is not None:
         sys.stderr.write(f"{PROGRAM}: {lacking}\n")
-        return EXIT_BAD_CONFIG
+        return EXIT_USAGE
     try:
         config = load_config(options.config, lambda folder: load_tls_files(folder).identity)
         if not options.insecure_i_know:
@@ -94,7 +92,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         # An error found after the file was read lacks the file's name; one without a key belongs to another file.
         located = ConfigError(str(options.config), error.key, error.problem) if error.key else error
         sys.stderr.write(f"{PROGRAM}: {located}\n")
-        return EXIT_FAILURE if isinstance(error, StartError) else EXIT_BAD_CONFIG
+        return EXIT_FAILED if isinstance(error, StartError) else EXIT_USAGE
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -195,9 +193,9 @@ def _run(config: SidecarConfig) -> int:
             raise
         except Exception:
             log.critical("failed", exc_info=True)
-            code = EXIT_FAILURE
+            code = EXIT_FAILED
     if failure.is_set():
-        code = EXIT_FAILURE
+        code = EXIT_FAILED
     logs.end_if_stalled(code)
     return code
 

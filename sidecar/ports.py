@@ -30,7 +30,7 @@ class DataPlane(Protocol):
         It must be called for every ResponseArrived. After a problem, another server's answer is taken.
         """
 
-    def answered_here(self, request_id: RequestId) -> None:
+    def answered_locally(self, request_id: RequestId) -> None:
         """Robot: report that the application has an answer from elsewhere; the request's end is told all the same."""
 
     def complete(self, execution: ExecutionId, payload: bytes, processing_s: float) -> None:

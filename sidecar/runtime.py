@@ -26,7 +26,7 @@ from plr.sidecar.control.revocations import Revocations
 from plr.sidecar.core.control.session import Apply, ControlSession
 from plr.sidecar.core.control.ways import ControlInterface
 from plr.sidecar.core.engine.engine import EngineConfig
-from plr.sidecar.local.server import LocalServer, LocalSocketError
+from plr.sidecar.local.server import LocalSocketError, LocalSocketServer
 from plr.sidecar.local.state import LocalState, MappingOrigin
 from plr.sidecar.net.control_dialer import ControlDialer
 from plr.sidecar.net.dataplane import DataPlaneHooks, ThreadedDataPlane
@@ -64,7 +64,7 @@ DEFAULT_STUN_PORT = 3478
 """RFC 8489 section 8; used on the control plane's hosts when no STUN server is named."""
 
 
-class Sidecar:
+class SidecarRuntime:
     """All parts of one sidecar; also implements the control client's `ControlHooks`."""
 
     def __init__(self, config: SidecarConfig, version: str) -> None:
@@ -247,7 +247,7 @@ class Sidecar:
             self._metrics.close()
         interpreter.clear()
 
-    def _make_local(self, version: str) -> LocalServer | None:
+    def _make_local(self, version: str) -> LocalSocketServer | None:
         path = self._config.local_socket_path(os.environ.get("RUNTIME_DIRECTORY"))
         if path is None:
             return None
@@ -266,7 +266,7 @@ class Sidecar:
             clock=self._clock,
             started_at=time.monotonic(),
         )
-        return LocalServer(path, state)
+        return LocalSocketServer(path, state)
 
     def _open_metrics(self) -> None:
         listen = self._config.metrics_listen
@@ -409,7 +409,7 @@ def run(config: SidecarConfig, version: str, stopping: StopRequest) -> int:
     """
     if config.insecure:
         log.warning("insecure: true: the identities of the control plane and of all peers are not checked")
-    sidecar = Sidecar(config, version)
+    sidecar = SidecarRuntime(config, version)
     notifier = Notifier()
     sidecar.start()
     interpreter.settle()

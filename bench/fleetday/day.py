@@ -17,10 +17,10 @@ from bench.fleetday.timeline import Timeline
 from plr.controlplane.core.base.member_table import MAX_MEMBERS
 from plr.controlplane.core.control.events import Settings
 from plr.controlplane.core.estimate.processing import MAX_PROCESSING
-from plr.controlplane.core.estimate.reached import MAX_PAIRS
+from plr.controlplane.core.estimate.reached import MAX_REACHED_PAIRS
 from plr.controlplane.core.explain.departed import MAX_DEPARTED, MAX_EXPLAINED
 from plr.controlplane.core.policy.policy import CallRule, OfferRule, Policy
-from plr.controlplane.core.publish.history import MAX_CHANGES, MAX_HISTORIES
+from plr.controlplane.core.publish.history import MAX_HISTORIES, MAX_REMEMBERED_CHANGES
 from plr.controlplane.core.publish.publisher import MAX_GONE_SNAPSHOTS
 from plr.controlplane.core.publish.views import MAX_PERMITS_KEPT
 from plr.controlplane.core.registry.registry import MAX_REMEMBERED_REMOVALS
@@ -60,11 +60,11 @@ CAPPED = {
     "departed._departures": MAX_DEPARTED,
     "departed._last_known": MAX_EXPLAINED,
     "history._histories": MAX_HISTORIES,
-    "reached._pairs": MAX_PAIRS,
-    "reached._robots_of": MAX_PAIRS,
-    "reached._servers_of": MAX_PAIRS,
-    "reached._servers_of[]": MAX_PAIRS,
-    "history._histories[].changes": MAX_HISTORIES * MAX_CHANGES,
+    "reached._pairs": MAX_REACHED_PAIRS,
+    "reached._robots_of": MAX_REACHED_PAIRS,
+    "reached._servers_of": MAX_REACHED_PAIRS,
+    "reached._servers_of[]": MAX_REACHED_PAIRS,
+    "history._histories[].changes": MAX_HISTORIES * MAX_REMEMBERED_CHANGES,
     "restlessness.shares._kept": MAX_MEMBERS,
     "urgency.shares._kept": MAX_MEMBERS,
     "registry.postponed.shares._kept": MAX_MEMBERS,

@@ -15,7 +15,7 @@ from plr.controlplane.core.control.events import (
     StreamLostNotice,
     UnmetNotice,
 )
-from plr.controlplane.core.publish.messages import Close, CloseReason, Send
+from plr.controlplane.core.publish.messages import CloseReason, EndStream, SendMessage
 from plr.controlplane.core.registry.registry import Refusal
 from plr.controlplane.observe.event_log import EventLog
 from plr.controlplane.observe.remembered import departures
@@ -234,11 +234,11 @@ class Plane:
             return
         while (event := core.next_event()) is not None:
             match event:
-                case Send(stream=stream, message=message):
+                case SendMessage(stream=stream, message=message):
                     self.sent += 1
                     if stream in self._lines:
                         self._lines[stream].put(message)
-                case Close(stream=stream, reason=reason):
+                case EndStream(stream=stream, reason=reason):
                     if stream in self._lines:
                         self._lines[stream].close(reason)
                 case NackNotice(sidecar=name, nack=nack):

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 from plr.controlplane.core.control.control import ControlCore
 from plr.controlplane.core.control.events import Settings
-from plr.controlplane.core.publish.messages import Send
+from plr.controlplane.core.publish.messages import SendMessage
 from plr.controlplane.solver.matcher import Matcher
 from plr.protos.base.histogram import Histogram
 from plr.protos.model.ids import PROTOCOL_VERSION, InterfaceId, InterfaceName, NodeName, Role, ServiceName, SessionId
@@ -160,7 +160,7 @@ class Crowd:
         """Take what the core sends; return how many mappings there were."""
         mappings = 0
         while (event := self.core.next_event()) is not None:
-            if isinstance(event, Send) and isinstance(event.message, MappingSet):
+            if isinstance(event, SendMessage) and isinstance(event.message, MappingSet):
                 self.mappings[self._owner[event.stream]] = event.message
                 mappings += 1
         return mappings

@@ -14,7 +14,7 @@ import numpy as np
 from ortools.graph.python import min_cost_flow
 
 from plr.controlplane.core.problem.objectives import epsilon_matrix, path_costs
-from plr.controlplane.core.problem.problem import Block, BlockKey, FleetKey, Objective, Path, Problem
+from plr.controlplane.core.problem.problem import Block, BlockKey, FleetKey, Objective, PairIndex, Problem
 from plr.protos.model.ids import InterfaceName, NodeName, ServiceName
 
 SERVICE = ServiceName("/bench")
@@ -51,7 +51,7 @@ def random_block(
 ) -> Block:
     """Return one robot of such a fleet."""
     carriers = [10 ** rng.uniform(-3, -0.5) for _ in range(interfaces)]
-    found: dict[tuple[Path, Path], float] = {}
+    found: dict[tuple[PairIndex, PairIndex], float] = {}
     if lifts:
         tried = range(len(names))
         paths = [

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 from bench.matcher.feed import REPORT_INTERVAL_S, ROBOT, SERVICE
 from plr.controlplane.core.control.control import ControlCore
 from plr.controlplane.core.control.events import Settings
-from plr.controlplane.core.publish.messages import Send
+from plr.controlplane.core.publish.messages import SendMessage
 from plr.controlplane.core.registry.registry import Refusal
 from plr.controlplane.solver.matcher import Matcher
 from plr.protos.model.ids import PROTOCOL_VERSION, InterfaceId, InterfaceName, Role, SessionId
@@ -82,5 +82,5 @@ class Plane:
             plan = self._matcher.solve(picture.problem, time_limit_s=SOLVER_LIMIT_S, hint=self._core.plan)
             self._core.solved(self._core.settle(picture, plan, now), now)
         while (event := self._core.next_event()) is not None:
-            if isinstance(event, Send) and event.stream == self._robot and isinstance(event.message, MappingSet):
+            if isinstance(event, SendMessage) and event.stream == self._robot and isinstance(event.message, MappingSet):
                 self.mapping = next(iter(event.message.services), None)

@@ -27,7 +27,7 @@ from plr.protos.program.tls_files import (
     CRL_FILE,
     KEY_FILE,
     KEY_FORBIDDEN,
-    MAX_FILE_BYTES,
+    MAX_TLS_FILE_BYTES,
     load_private_key,
     read_guarded,
 )
@@ -191,7 +191,7 @@ def refuse_taken(out: Path, name: str, *, own: bool) -> None:
         return
     try:
         # The folder may belong to the node's user, who may put anything there.
-        certificate = x509.load_pem_x509_certificate(read_regular(path, MAX_FILE_BYTES))
+        certificate = x509.load_pem_x509_certificate(read_regular(path, MAX_TLS_FILE_BYTES))
         owners = [each.value for each in certificate.subject.get_attributes_for_oid(NameOID.COMMON_NAME)]
     except (OSError, ValueError):
         owners = []

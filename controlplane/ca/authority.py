@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
     from cryptography.hazmat.primitives.asymmetric import ec
 
-    from plr.controlplane.ca.request import Request
+    from plr.controlplane.ca.request import CertificateRequest
     from plr.protos.trust.identity import IdentityRole
 
 DAY_S = 86_400.0
@@ -116,7 +116,9 @@ class Authority:
             self._refuse_key(name, fingerprint(key.public_key()), "the key", "leave out --keep-key")
         return self._issue(name, last.role, self._validity(days), key or generate_key())
 
-    def sign(self, request: Request, *, renewing: bool = False, days: float = DEFAULT_DAYS) -> x509.Certificate:
+    def sign(
+        self, request: CertificateRequest, *, renewing: bool = False, days: float = DEFAULT_DAYS
+    ) -> x509.Certificate:
         """Certify the key of a request whose name and role the operator has confirmed; raises AuthorityError.
 
         It works like `issue`, or `renew`. A key serves one name only, and none once it was revoked.

@@ -17,6 +17,7 @@ from plr.protos.base.printable import escaped
 from plr.protos.model.names import node_name, text
 from plr.protos.program import endings
 from plr.protos.program.arguments import checked
+from plr.protos.program.exit_codes import EXIT_FAILED, EXIT_OK, EXIT_USAGE
 from plr.protos.trust.identity import IdentityRole
 
 if TYPE_CHECKING:
@@ -24,9 +25,6 @@ if TYPE_CHECKING:
 
     from plr.protos.program.arguments import Commands
 
-EXIT_OK = 0
-EXIT_FAILED = 1
-EXIT_USAGE = 2
 
 _EXAMPLES = """examples:
   plr ca init --name warehouse

@@ -20,10 +20,10 @@ if TYPE_CHECKING:
 VARIABLE = "PLR_CA_PASSPHRASE"
 NEW_VARIABLE = "PLR_CA_NEW_PASSPHRASE"
 
-MIN_BYTES = 8
+MIN_PASSPHRASE_BYTES = 8
 """Shorter ones are found by trial, however costly a guess is; NIST SP 800-63B sets the same minimum."""
 
-MAX_BYTES = 1023
+MAX_PASSPHRASE_BYTES = 1023
 """The longest that OpenSSL accepts."""
 
 _NOT_THE_OWNER = 0o077
@@ -59,7 +59,7 @@ class PassphraseSource:
         if passphrase is not None:
             return _checked(passphrase, self.variable if self.file is None else str(self.file))
         self._expect_terminal(", or --no-passphrase to leave the CA's key unencrypted")
-        passphrase = _checked(_ask(f"{self.what} (at least {MIN_BYTES} characters): "), self.what)
+        passphrase = _checked(_ask(f"{self.what} (at least {MIN_PASSPHRASE_BYTES} characters): "), self.what)
         if _ask("again: ") != passphrase:
             raise ConfigError(self.what, "", "the two differ; nothing was changed")
         return passphrase
@@ -84,8 +84,8 @@ def _not_empty(passphrase: bytes, where: str) -> bytes:
 
 
 def _checked(passphrase: bytes, where: str) -> bytes:
-    if not MIN_BYTES <= len(passphrase) <= MAX_BYTES:
-        raise ConfigError(where, "", f"expected a passphrase of {MIN_BYTES} to {MAX_BYTES} bytes")
+    if not MIN_PASSPHRASE_BYTES <= len(passphrase) <= MAX_PASSPHRASE_BYTES:
+        raise ConfigError(where, "", f"expected a passphrase of {MIN_PASSPHRASE_BYTES} to {MAX_PASSPHRASE_BYTES} bytes")
     if b"\n" in passphrase or b"\0" in passphrase:
         raise ConfigError(where, "", "expected a passphrase on one line")
     return passphrase

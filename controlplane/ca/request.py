@@ -32,14 +32,14 @@ if TYPE_CHECKING:
 
 REQUEST_FILE = "request.pem"
 
-MAX_REQUEST_BYTES = 4096
+MAX_CERTIFICATE_REQUEST_BYTES = 4096
 """Longest request, PEM: `plr request` writes some 420 bytes."""
 
 _EXTENSION_REQUEST = "1.2.840.113549.1.9.14"
 
 
 @dataclass(frozen=True, slots=True)
-class Request:
+class CertificateRequest:
     """A parsed request: that the node has the key is checked, its identity is not."""
 
     name: NodeName
@@ -62,10 +62,10 @@ def build_request(name: str, role: IdentityRole, key: ec.EllipticCurvePrivateKey
     return builder.sign(key, hashes.SHA256(), ecdsa_deterministic=True).public_bytes(Encoding.PEM)
 
 
-def parse_request(pem: bytes) -> Request:
+def parse_request(pem: bytes) -> CertificateRequest:
     """Return the parsed request; raises DecodeError, whose text is fit for a terminal."""
-    if len(pem) > MAX_REQUEST_BYTES:
-        raise DecodeError(f"the request is longer than {MAX_REQUEST_BYTES} bytes")
+    if len(pem) > MAX_CERTIFICATE_REQUEST_BYTES:
+        raise DecodeError(f"the request is longer than {MAX_CERTIFICATE_REQUEST_BYTES} bytes")
     try:
         return _checked(x509.load_pem_x509_csr(pem))
     except DecodeError:
@@ -75,7 +75,7 @@ def parse_request(pem: bytes) -> Request:
         raise DecodeError(f"the request is malformed: {type(error).__name__}") from error
 
 
-def _checked(request: x509.CertificateSigningRequest) -> Request:
+def _checked(request: x509.CertificateSigningRequest) -> CertificateRequest:
     key = request.public_key()
     if not (isinstance(key, ec.EllipticCurvePublicKey) and isinstance(key.curve, ec.SECP256R1)):
         raise DecodeError(f"the request's key is not an ECDSA key on P-256, but {_kind(key)}")
@@ -97,7 +97,7 @@ def _checked(request: x509.CertificateSigningRequest) -> Request:
         raise DecodeError(f"the request's subject is {subject!a}, expected the name alone: CN={name}")
     # A key has several encodings, such as with the curve's parameters or compressed. Reduce them to one.
     point = key.public_bytes(Encoding.X962, PublicFormat.UncompressedPoint)
-    return Request(name, role, ec.EllipticCurvePublicKey.from_encoded_point(ec.SECP256R1(), point))
+    return CertificateRequest(name, role, ec.EllipticCurvePublicKey.from_encoded_point(ec.SECP256R1(), point))
 
 
 def _kind(key: object) -> str:

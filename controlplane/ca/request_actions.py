@@ -15,7 +15,13 @@ from plr.controlplane.ca.certificates import generate_key
 from plr.controlplane.ca.files import PRIVATE_FILE, PUBLIC_FILE, make_private, write_atomically, write_certificate
 from plr.controlplane.ca.folder import AuthorityFolder
 from plr.controlplane.ca.key_file import clear_pem
-from plr.controlplane.ca.request import MAX_REQUEST_BYTES, REQUEST_FILE, build_request, fingerprint, parse_request
+from plr.controlplane.ca.request import (
+    MAX_CERTIFICATE_REQUEST_BYTES,
+    REQUEST_FILE,
+    build_request,
+    fingerprint,
+    parse_request,
+)
 from plr.protos.base.errors import ConfigError, DecodeError
 from plr.protos.base.printable import escaped
 from plr.protos.program.regular_file import read_regular
@@ -28,7 +34,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from plr.controlplane.ca.index import Record
-    from plr.controlplane.ca.request import Request
+    from plr.controlplane.ca.request import CertificateRequest
 
 _MAY = {
     IdentityRole.ROBOT: "may call services",
@@ -88,9 +94,9 @@ def _own_key(out: Path, name: str) -> ec.EllipticCurvePrivateKey:
     return key
 
 
-def _read(path: Path) -> Request:
+def _read(path: Path) -> CertificateRequest:
     try:
-        pem = read_regular(path, MAX_REQUEST_BYTES + 1)
+        pem = read_regular(path, MAX_CERTIFICATE_REQUEST_BYTES + 1)
     except OSError as error:
         raise AuthorityError(f"{path}: cannot be read: {error.strerror or error}") from error
     try:
@@ -99,7 +105,7 @@ def _read(path: Path) -> Request:
         raise AuthorityError(f"{path}: {error}; make it with: plr request") from error
 
 
-def _confirm(arguments: argparse.Namespace, asked: Request, records: Iterable[Record]) -> None:
+def _confirm(arguments: argparse.Namespace, asked: CertificateRequest, records: Iterable[Record]) -> None:
     """Return if the operator confirms this, by options or at the terminal; raises AuthorityError or ConfigError."""
     name, role, key = asked.name, asked.role.value, fingerprint(asked.key)
     for what, wanted, found in (

@@ -15,6 +15,7 @@ from plr.protos.base.printable import escaped
 from plr.protos.plr.v1 import admin_pb2_grpc
 from plr.protos.program import tls_advice
 from plr.protos.program.arguments import number
+from plr.protos.program.exit_codes import EXIT_FAILED, EXIT_USAGE
 from plr.protos.program.tls_files import load_tls_files
 from plr.protos.trust.identity import CONTROL_PLANE_DNS
 
@@ -29,8 +30,6 @@ DEFAULT_ADDRESS = "127.0.0.1:50051"
 
 MIN_TIMEOUT_S, MAX_TIMEOUT_S = 0.001, 3600.0
 
-EXIT_FAILED = 1
-EXIT_USAGE = 2
 
 _OPTIONS = (
     # A thousand robots with their paths and histograms exceed gRPC's default of 4 MiB.

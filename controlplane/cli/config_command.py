@@ -8,13 +8,12 @@ import sys
 from typing import TYPE_CHECKING
 
 from plr.controlplane.config.controlplane import ControlPlaneConfig
+from plr.protos.program.exit_codes import EXIT_OK
 
 if TYPE_CHECKING:
     import argparse
 
     from plr.protos.program.arguments import Commands
-
-EXIT_OK = 0
 
 
 def add_to(commands: Commands, summary: str) -> None:

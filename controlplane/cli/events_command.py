@@ -17,12 +17,12 @@ from plr.protos.convert import event_list_from_proto, event_query_to_proto
 from plr.protos.model.fleet_events import EventQuery
 from plr.protos.model.names import node_name
 from plr.protos.program.arguments import checked, whole
+from plr.protos.program.exit_codes import EXIT_OK
 
 if TYPE_CHECKING:
     from plr.protos.model.fleet_events import EventList
     from plr.protos.program.arguments import Commands
 
-EXIT_OK = 0
 
 LAST = 100
 

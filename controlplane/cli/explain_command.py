@@ -12,13 +12,13 @@ from plr.protos.convert import explanation_from_proto
 from plr.protos.model.names import node_name, service_name
 from plr.protos.plr.v1 import admin_pb2
 from plr.protos.program.arguments import checked
+from plr.protos.program.exit_codes import EXIT_OK
 
 if TYPE_CHECKING:
     from plr.protos.model.explanation import Explanation
     from plr.protos.plr.v1 import admin_pb2_grpc
     from plr.protos.program.arguments import Commands
 
-EXIT_OK = 0
 
 _EPILOG = """\
 shows: the mapping in force and its reason; for each pair of an interface and a server, the estimated probability that

@@ -18,6 +18,7 @@ from plr.controlplane.planning.workload import DEFAULT, Compute, Workload
 from plr.protos.base.printable import escaped
 from plr.protos.program import extras
 from plr.protos.program.arguments import whole
+from plr.protos.program.exit_codes import EXIT_NO, EXIT_OK, EXIT_USAGE
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -26,14 +27,11 @@ if TYPE_CHECKING:
     from plr.controlplane.planning.traces import RecordedPaths
     from plr.protos.program.arguments import Commands
 
-EXIT_MET = 0
-EXIT_NOT_MET = 1
-EXIT_USAGE = 2
 
-MAX_REQUESTS = 5_000_000
+MAX_REPLAYED_REQUESTS = 5_000_000
 """Most requests sent through traces in one run: some minutes."""
 
-MAX_MESSAGE_BYTES = 1 << 24
+MAX_REQUEST_OR_ANSWER_BYTES = 1 << 24
 
 _EPILOG = """\
 The LSC theorem says that one server behind one path cannot be latency-reliable on commodity infrastructure: it misses
@@ -79,7 +77,7 @@ def add_to(commands: Commands, summary: str) -> None:
     )
     plan.add_argument("--json", action="store_true", help="print the table as JSON")
     workload = plan.add_argument_group("requests that are sent through traces")
-    size = whole(1, MAX_MESSAGE_BYTES)
+    size = whole(1, MAX_REQUEST_OR_ANSWER_BYTES)
     workload.add_argument("--request-bytes", type=size, metavar="N", help=f"the default is {DEFAULT.request_bytes}")
     workload.add_argument("--answer-bytes", type=size, metavar="N", help=f"the default is {DEFAULT.answer_bytes}")
     workload.add_argument(
@@ -156,7 +154,7 @@ def _plan(arguments: argparse.Namespace) -> int:
         sys.stdout.write(json.dumps(told, indent=2) + "\n")
     else:
         sys.stdout.write(plan_text.render(source, prospects, deadline_s, arguments.target) + "\n")
-    return EXIT_NOT_MET if arguments.target is not None and least is None else EXIT_MET
+    return EXIT_NO if arguments.target is not None and least is None else EXIT_OK
 
 
 def _recorded(arguments: argparse.Namespace) -> tuple[Source, float]:
@@ -177,8 +175,10 @@ def _replayed(arguments: argparse.Namespace) -> tuple[Source, float]:
     workload = replace(DEFAULT, **_given(arguments))
     traces = _read(arguments.traces)
     requests = sum(trace.duration_s for trace in traces) * workload.rate_hz
-    if requests > MAX_REQUESTS:
-        raise _UsageError(f"{requests:.0f} requests, {MAX_REQUESTS} at most: give fewer traces or a lower --rate-hz")
+    if requests > MAX_REPLAYED_REQUESTS:
+        raise _UsageError(
+            f"{requests:.0f} requests, {MAX_REPLAYED_REQUESTS} at most: give fewer traces or a lower --rate-hz"
+        )
     if requests < 1.0:
         raise _UsageError("the traces are too short for a single request")
     return ReplayedTraces(traces, workload), arguments.deadline_ms / 1e3

@@ -11,15 +11,12 @@ from plr.controlplane.core.policy.explain import explain
 from plr.protos.base.errors import ConfigError
 from plr.protos.model.names import node_name, service_name
 from plr.protos.program.arguments import checked
+from plr.protos.program.exit_codes import EXIT_NO, EXIT_OK, EXIT_USAGE
 
 if TYPE_CHECKING:
     import argparse
 
     from plr.protos.program.arguments import Commands
-
-EXIT_ALLOWED = 0
-EXIT_DENIED = 1
-EXIT_USAGE = 2
 
 
 def add_to(commands: Commands, summary: str) -> None:
@@ -47,4 +44,4 @@ def _check(arguments: argparse.Namespace) -> int:
     decision = explain(policy, arguments.robot, arguments.service, arguments.cloud)
     lines = ["allowed" if decision.allowed else "denied", *(f"  {reason}" for reason in decision.reasons)]
     sys.stdout.write("\n".join(lines) + "\n")
-    return EXIT_ALLOWED if decision.allowed else EXIT_DENIED
+    return EXIT_OK if decision.allowed else EXIT_NO

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import grpc
 
 from plr.controlplane.cli import event_text, status_table
-from plr.controlplane.cli.admin_client import EXIT_FAILED, AskError, add_options, ask
+from plr.controlplane.cli.admin_client import AskError, add_options, ask
 from plr.protos.base.errors import DecodeError
 from plr.protos.convert import (
     departed_from_proto,
@@ -21,11 +21,12 @@ from plr.protos.convert import (
     status_from_proto,
     status_query_to_proto,
 )
-from plr.protos.convert.fields import MAX_SIDECARS
+from plr.protos.convert.fields import MAX_LISTED_SIDECARS
 from plr.protos.model.names import node_name
 from plr.protos.model.status import StatusQuery
 from plr.protos.plr.v1 import admin_pb2
 from plr.protos.program.arguments import checked
+from plr.protos.program.exit_codes import EXIT_FAILED, EXIT_OK
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
@@ -36,7 +37,6 @@ if TYPE_CHECKING:
     from plr.protos.plr.v1 import admin_pb2_grpc
     from plr.protos.program.arguments import Commands
 
-EXIT_OK = 0
 
 DETAILED_AT_MOST = 64
 """Most sidecars in order that are still shown with their mapping and paths: a few screens full."""
@@ -75,8 +75,8 @@ class _Answer:
     def take(self, part: admin_pb2.GetStatusResponse) -> None:
         """Add a part of the answer; raises DecodeError."""
         self.sidecars += status_from_proto(part)
-        if len(self.sidecars) > MAX_SIDECARS:
-            raise DecodeError(f"sidecars has more than {MAX_SIDECARS} elements")
+        if len(self.sidecars) > MAX_LISTED_SIDECARS:
+            raise DecodeError(f"sidecars has more than {MAX_LISTED_SIDECARS} elements")
         if self.raw is not None:
             self.raw.MergeFrom(part)
         del part.sidecars[:]

@@ -18,15 +18,15 @@ if TYPE_CHECKING:
     from plr.protos.model.report import PathReport
     from plr.protos.model.status import ResourceStatus, SidecarStatus
 
-MAX_LINES = 256
+MAX_LINES_OF_SIDECAR = 256
 """Most lines on one sidecar: its claims of what it offers, lacks or reaches must not hide the others."""
 
-MAX_LINE = 1000
+MAX_LINE_CHARACTERS = 1000
 """Characters of each line."""
 
 MAX_HINTED = 100
 """Longest service name, in characters, for which a similar one is sought."""
-MAX_CLOSE = 8
+MAX_SIMILAR_NAMES = 8
 """Similar names considered, since a cloud may offer some of them itself."""
 MAX_COMPARED = 20_000_000
 """Pairs of characters compared in all, at most a second's work: 1,000 names with 50 others of 20 characters."""
@@ -55,12 +55,12 @@ def render(sidecars: Sequence[SidecarStatus], own: RevocationSet = NO_REVOCATION
         wrong += _revocations(status.revocations, of_own, now_wall)
         details += ((line, True) for line in wrong)
         if details:
-            if len(details) > MAX_LINES:
+            if len(details) > MAX_LINES_OF_SIDECAR:
                 details.sort(key=lambda detail: not detail[1])
-            shown = (shortened(line, MAX_LINE) for line, _ in details[:MAX_LINES])
+            shown = (shortened(line, MAX_LINE_CHARACTERS) for line, _ in details[:MAX_LINES_OF_SIDECAR])
             lines += ["", f"{status.peer.name}:", *(f"  {line}" for line in shown)]
-        if len(details) > MAX_LINES:
-            lines.append(f"  and {len(details) - MAX_LINES} more: plr status {status.peer.name} --json")
+        if len(details) > MAX_LINES_OF_SIDECAR:
+            lines.append(f"  and {len(details) - MAX_LINES_OF_SIDECAR} more: plr status {status.peer.name} --json")
     abridged = sum(status.abridged for status in sidecars)
     if abridged:
         what = f"mapping and paths of {abridged} sidecars without problems"
@@ -126,7 +126,9 @@ class _Hints:
             return ""
         if name not in self._found:
             self._left -= len(name) * sum(map(len, self._offered))
-            self._found[name] = difflib.get_close_matches(name, self._offered, MAX_CLOSE) if self._left >= 0 else []
+            self._found[name] = (
+                difflib.get_close_matches(name, self._offered, MAX_SIMILAR_NAMES) if self._left >= 0 else []
+            )
         close = next((other for other in self._found[name] if other not in but), name)
         return f"; did you mean {close}?" if close != name else ""
 

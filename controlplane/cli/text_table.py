@@ -10,7 +10,7 @@ if TYPE_CHECKING:
 MAX_PADDED = 64
 """Widest padding in characters: one long cell does not widen the column for the others."""
 
-MAX_LISTED = 100
+MAX_LIST_CHARACTERS = 100
 """Characters of a list in one cell."""
 
 
@@ -27,8 +27,8 @@ def listed(names: Sequence[str]) -> str:
     """Return the first of these for one cell, at least one, and how many more there are; "-" if there are none."""
     if not names:
         return "-"
-    shown = [shortened(names[0], MAX_LISTED)]
-    room = MAX_LISTED - len(shown[0])
+    shown = [shortened(names[0], MAX_LIST_CHARACTERS)]
+    room = MAX_LIST_CHARACTERS - len(shown[0])
     for name in names[1:]:
         room -= 1 + len(name)
         if room < 0:

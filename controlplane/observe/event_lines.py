@@ -14,10 +14,10 @@ from plr.protos.model.names import clean_text, node_name
 if TYPE_CHECKING:
     import enum
 
-MAX_LINE_BYTES = 4096
+MAX_EVENT_LINE_BYTES = 4096
 """A longer line is damaged: a text has at most 255 bytes."""
 
-MAX_NUMBER = 1 << 62
+MAX_EVENT_NUMBER = 1 << 62
 
 E = TypeVar("E", bound="enum.Enum")
 
@@ -40,7 +40,7 @@ def encode(event: FleetEvent) -> str:
 
 def decode(line: bytes) -> FleetEvent:
     """Parse a line; raises DecodeError if it is not one of ours, or damaged."""
-    if len(line) > MAX_LINE_BYTES:
+    if len(line) > MAX_EVENT_LINE_BYTES:
         raise DecodeError("the line is too long")
     try:
         shown = json.loads(line)
@@ -49,7 +49,7 @@ def decode(line: bytes) -> FleetEvent:
     if not isinstance(shown, dict):
         raise DecodeError("expected a JSON object")
     number = shown.get("number")
-    if type(number) is not int or not 0 < number < MAX_NUMBER:
+    if type(number) is not int or not 0 < number < MAX_EVENT_NUMBER:
         raise DecodeError("expected a number")
     kind = _member(EventKind, shown, "kind")
     if kind is None:

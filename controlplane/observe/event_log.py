@@ -3,7 +3,7 @@
     state_dir/events.jsonl   one event a line, JSON (`event_lines`); appended to
     state_dir/lock           held while the program runs, and touched: its time tells the next run when this one ended
 
-The file is bounded: when it has grown to MAX_FILE_BYTES it is rewritten from memory. It is also rewritten after a
+The file is bounded: when it has grown to MAX_EVENT_FILE_BYTES it is rewritten from memory. It is also rewritten after a
 failed write: a full disk costs nothing but time, as long as the program lives. Damaged lines (a power cut within one, a
 bad sector) are skipped and counted. A thread of its own writes: a slow disk holds up nobody.
 """
@@ -41,7 +41,7 @@ log = logging.getLogger(__name__)
 FILE = "events.jsonl"
 LOCK_FILE = "lock"
 
-MAX_FILE_BYTES = 8 << 20
+MAX_EVENT_FILE_BYTES = 8 << 20
 """Size at which the file is rewritten: the events in memory take half of it at most."""
 
 MAX_UNWRITTEN = 4096
@@ -230,8 +230,8 @@ class EventLog:
     def _read(self, folder: OwnFolder) -> list[FleetEvent]:
         with folder.open_to_read(FILE) as file:
             size = file.seek(0, os.SEEK_END)
-            file.seek(max(0, size - 2 * MAX_FILE_BYTES))
-            data = file.read(2 * MAX_FILE_BYTES)
+            file.seek(max(0, size - 2 * MAX_EVENT_FILE_BYTES))
+            data = file.read(2 * MAX_EVENT_FILE_BYTES)
         # New lines must not be appended to a truncated one.
         self._write_all = not data.endswith(b"\n")
         read = []
@@ -305,7 +305,7 @@ class EventLog:
         if self._file is None:
             self._file = self._open_to_append(FILE)
         own_folder.write_through(self._file, data)
-        if self._file.tell() > MAX_FILE_BYTES:
+        if self._file.tell() > MAX_EVENT_FILE_BYTES:
             with self._condition:
                 self._write_all = True
 

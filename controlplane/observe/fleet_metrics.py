@@ -39,7 +39,7 @@ SERIES_OF_MEMBER = 6
 MAX_SERIES_OF_SERVICES = 20_000
 """Series of all servers by service, two for each service; servers have equal shares."""
 
-MAX_GONE = 1024
+MAX_GONE_WITH_SERIES = 1024
 """Departed members that still have series, the last to go."""
 
 REUSED_S = 1.0
@@ -117,7 +117,7 @@ class FleetCollector:
 
 def families(fleet: Fleet) -> Iterable[Metric]:
     """Return all metrics, whose samples are made as they are read."""
-    fleet = replace(fleet, gone=fleet.gone[:MAX_GONE])
+    fleet = replace(fleet, gone=fleet.gone[:MAX_GONE_WITH_SERIES])
     robots = [member for member in fleet.members if member.role is Role.ROBOT]
     services = _services(fleet)
     of_services = sum(2 * len(found) for _, found, _ in services)

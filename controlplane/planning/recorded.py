@@ -26,8 +26,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from plr.controlplane.core.problem.problem import Choice
-    from plr.controlplane.core.problem.problem import Path as PathIndex
+    from plr.controlplane.core.problem.problem import Choice, PairIndex
     from plr.protos.base.histogram import Histogram
     from plr.protos.model.explanation import Explanation, PairExplanation
     from plr.protos.model.mapping import Assignment
@@ -35,7 +34,7 @@ if TYPE_CHECKING:
 MAX_CHOICES = 20_000
 """Most sets examined; if there are more, only the servers with the least epsilon of each interface are used."""
 
-MAX_PROBES = 100.0
+MAX_COUNTED_PROBES = 100.0
 """Beyond this many, probes no longer move a probability closer to 0 or 1: they are small."""
 
 MIN_REQUESTS = 20.0
@@ -140,7 +139,7 @@ class RecordedService:
             return pair.miss.mean
         network, later_s = self._network(pair)
         over = network.sum_exceeds(_distribution(pair.compute), deadline_s - later_s)
-        samples = pair.network.total / SAMPLE or min(pair.probes, MAX_PROBES)
+        samples = pair.network.total / SAMPLE or min(pair.probes, MAX_COUNTED_PROBES)
         return (over * samples + IGNORANCE.misses) / (samples + IGNORANCE.weight)
 
     def _network(self, pair: PairExplanation) -> tuple[Distribution, float]:
@@ -154,8 +153,8 @@ class RecordedService:
         return of_probes, self._overhead_s
 
     def _lifts_between_interfaces(
-        self, index: Mapping[Assignment, PathIndex], epsilon: Sequence[Sequence[float | None]]
-    ) -> Iterator[tuple[tuple[PathIndex, PathIndex], float]]:
+        self, index: Mapping[Assignment, PairIndex], epsilon: Sequence[Sequence[float | None]]
+    ) -> Iterator[tuple[tuple[PairIndex, PairIndex], float]]:
         """Yield how much more often than by chance two paths miss together because their interfaces do.
 
         This holds whatever the servers. The factor is capped: both never miss more often than the better path alone.
@@ -169,8 +168,8 @@ class RecordedService:
                     yield (min(one, other), max(one, other)), min(max(1.0, joint.lift), most)
 
     def _lifts_through_servers(
-        self, index: Mapping[Assignment, PathIndex], deadline_s: float
-    ) -> dict[tuple[PathIndex, PathIndex], float]:
+        self, index: Mapping[Assignment, PairIndex], deadline_s: float
+    ) -> dict[tuple[PairIndex, PairIndex], float]:
         """Return how much more often than by chance two paths to one server miss together, as it runs a request once.
 
         P(both miss) is the mean, over the server's computing time, of the product of the two probabilities that the

@@ -16,18 +16,18 @@ import grpc
 from grpc_health.v1 import health, health_pb2, health_pb2_grpc
 from grpc_reflection.v1alpha import reflection
 
-from plr.controlplane.core.registry.registry import MAX_SIDECARS
 from plr.controlplane.loop import ControlLoop
 from plr.controlplane.observe.event_log import EventLog
 from plr.controlplane.observe.metrics import Metrics
 from plr.controlplane.serve import admin, service
 from plr.controlplane.serve.access import AccessGuard
 from plr.controlplane.serve.certificate_watch import CertificateKeeper
-from plr.controlplane.serve.stream_limits import MAX_MESSAGE_BYTES, MAX_STREAMS_PER_CONNECTION
+from plr.controlplane.serve.stream_limits import MAX_STREAM_MESSAGE_BYTES, MAX_STREAMS_PER_CONNECTION
 from plr.controlplane.serve.stun_server import start_stun_server
 from plr.controlplane.serve.tls_gate import TlsGate
 from plr.protos.base.host_port import split_host_port
 from plr.protos.model.fleet_events import EventKind
+from plr.protos.model.members import MAX_SIDECARS
 from plr.protos.program.version_option import describe
 from plr.protos.trust.clock_floor import ClockFloor
 
@@ -53,7 +53,7 @@ GRPC_OPTIONS: tuple[tuple[str, int], ...] = (
     # Our pings find connections that died silently; the lease has removed their sidecar by then.
     ("grpc.keepalive_time_ms", 20_000),
     ("grpc.keepalive_timeout_ms", 10_000),
-    ("grpc.max_receive_message_length", MAX_MESSAGE_BYTES),
+    ("grpc.max_receive_message_length", MAX_STREAM_MESSAGE_BYTES),
     ("grpc.max_concurrent_streams", MAX_STREAMS_PER_CONNECTION),
     # A connection without a call keeps its place for as long as somebody reads the answer to the previous call.
     ("grpc.max_connection_idle_ms", 60_000),
@@ -73,7 +73,7 @@ _SERVICES = ("", service.SERVICE_NAME, admin.SERVICE_NAME)
 """Names that the health service answers for; the first is the server as a whole."""
 
 
-class StartError(Exception):
+class ListenError(Exception):
     """An address is not available; the text names the configuration key."""
 
 
@@ -185,7 +185,7 @@ def _open_gate(config: ControlPlaneConfig, gate: TlsGate) -> str:
     try:
         return _join(host, gate.listen(host, port))
     except OSError as error:
-        raise StartError(f"listen: cannot listen on {config.listen}: {_reason(error)}") from error
+        raise ListenError(f"listen: cannot listen on {config.listen}: {_reason(error)}") from error
 
 
 async def _start_stun(
@@ -198,7 +198,7 @@ async def _start_stun(
             # "" means all addresses of both families, of which IPv6 may be missing.
             stun = await start_stun_server("" if host == "::" else host, port)
         except OSError as error:
-            raise StartError(f"stun_listen: cannot listen on {listen}: {error.strerror or error}") from error
+            raise ListenError(f"stun_listen: cannot listen on {listen}: {error.strerror or error}") from error
         cleanup.callback(stun.close)
         loop.stun_servers.append(stun)
         addresses.extend(_join(*address) for address in stun.addresses)
@@ -220,7 +220,7 @@ def _add_port(config: ControlPlaneConfig, server: grpc.aio.Server) -> str:
         socket.create_server((host, wanted), family=family).close()
         port = server.add_insecure_port(config.listen)
     except (OSError, RuntimeError) as error:
-        raise StartError(f"listen: cannot listen on {config.listen}: {_reason(error)}") from error
+        raise ListenError(f"listen: cannot listen on {config.listen}: {_reason(error)}") from error
     return _join(host, port)
 
 

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 PART_BYTES = 256 << 10
 """Bytes of a set's peers in one message: some 350 peers, a few milliseconds of the loop, far below gRPC's 4 MiB."""
 
-MAX_KEPT = 16_384
+MAX_KEPT_ENCODINGS = 16_384
 """Encodings kept: a fleet's peers, before and after each has changed. Beyond that all are discarded."""
 
 MAX_KEPT_BYTES = 64 << 20
@@ -89,7 +89,7 @@ class StreamEncoder:
             known = self._encoded.get(id(peer))
             if known is None:
                 known = peer, peer_to_proto(peer.with_token(b"")).SerializeToString()
-                if len(self._encoded) >= MAX_KEPT or self._kept_bytes + len(known[1]) > MAX_KEPT_BYTES:
+                if len(self._encoded) >= MAX_KEPT_ENCODINGS or self._kept_bytes + len(known[1]) > MAX_KEPT_BYTES:
                     self._encoded.clear()
                     self._kept_bytes = 0
                 self._encoded[id(peer)] = known

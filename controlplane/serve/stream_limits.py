@@ -9,7 +9,7 @@ from plr.protos.base.token_bucket import TokenBucket
 TOO_MANY_STREAMS = "too_many_streams"
 TOO_FAST = "too_fast"
 
-MAX_MESSAGE_BYTES = 4 << 20
+MAX_STREAM_MESSAGE_BYTES = 4 << 20
 """Longest message either way: 4096 peers with their credentials stay below, as does a report on as many paths."""
 
 MAX_FIRST_BYTES = 64 << 10

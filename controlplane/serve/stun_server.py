@@ -25,7 +25,7 @@ from ipaddress import IPv6Address
 from typing import TYPE_CHECKING, Any
 
 from plr.controlplane.core.stun.responder import StunOutcome, StunResponder
-from plr.protos.stun.codec import MAX_MESSAGE_BYTES
+from plr.protos.stun.codec import MAX_STUN_BYTES
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -118,7 +118,7 @@ class StunServer:
         for _ in range(BATCH_DATAGRAMS):
             try:
                 # One byte more than a message may have: a truncated one must not look complete.
-                data, ancillary, _, peer = sock.recvmsg(MAX_MESSAGE_BYTES + 1, _ANCILLARY_BYTES)
+                data, ancillary, _, peer = sock.recvmsg(MAX_STUN_BYTES + 1, _ANCILLARY_BYTES)
             except BlockingIOError:
                 return
             except OSError:

@@ -31,6 +31,7 @@ from plr.controlplane.serve.gate_pipe import PipeEnd
 from plr.controlplane.serve.half_open import HalfOpen
 from plr.controlplane.serve.handshakes import server_context, why_failed
 from plr.protos.base.token_bucket import TokenBucket
+from plr.protos.model.members import MAX_SIDECARS
 from plr.protos.trust.identity import CertificateError, IdentityRole
 
 if TYPE_CHECKING:
@@ -64,7 +65,7 @@ ON_THE_WAY_S = 1.0
 """How long one counts as such without a certificate: three round trips over a slow network. A stranger that takes
 longer keeps nobody waiting."""
 
-MAX_WAITING = 4096 + 256
+MAX_WAITING_CONNECTIONS = MAX_SIDECARS + 256
 """Connections that wait for their turn: the largest fleet. They have no TLS state yet; each costs a descriptor and a
 few kB."""
 
@@ -80,7 +81,7 @@ MAX_SILENT = 2048
 MAX_SILENT_PER_SOURCE = 1024
 """The same from one address."""
 
-MAX_CONNECTIONS = 2 * 4096 + 64
+MAX_TLS_CONNECTIONS = 2 * MAX_SIDECARS + 64
 """Concurrent connections: one for each sidecar that may register, its replacement, and some for operators."""
 
 MAX_CONNECTIONS_PER_NAME = 8
@@ -110,7 +111,7 @@ GAVE_UP = "gave_up"
 TELL_AGAIN_S = 60.0
 """Interval before a member refused again for the same reason is logged again."""
 
-MAX_TOLD = 4096
+MAX_LOGGED_REFUSALS = 4096
 """Pairs of member and reason kept for that; the one logged longest ago is dropped."""
 
 _LOG_LINES_PER_S = 1.0
@@ -160,7 +161,7 @@ class TlsGate:
         self._silent = HalfOpen(MAX_SILENT, MAX_SILENT_PER_SOURCE)
         self._handshakes = HalfOpen(MAX_HANDSHAKES, MAX_HANDSHAKES_PER_SOURCE)
         self._admission: Admission[asyncio.Task[None]] = Admission(
-            most_waiting=MAX_WAITING,
+            most_waiting=MAX_WAITING_CONNECTIONS,
             most_on_the_way=MAX_ON_THE_WAY,
             stranger_s=ON_THE_WAY_S,
             member_s=HANDSHAKE_TIMEOUT_S,
@@ -192,7 +193,9 @@ class TlsGate:
         """Accept connections from now on and return the port; raises OSError if the address is not available."""
         family = socket.AF_INET6 if ":" in host else socket.AF_INET
         dual = family == socket.AF_INET6 and host == "::" and socket.has_dualstack_ipv6()
-        self._socket = socket.create_server((host, port), family=family, backlog=MAX_WAITING, dualstack_ipv6=dual)
+        self._socket = socket.create_server(
+            (host, port), family=family, backlog=MAX_WAITING_CONNECTIONS, dualstack_ipv6=dual
+        )
         self._socket.setblocking(False)
         self._working = [
             self._loop.create_task(self._accept(self._socket)),
@@ -417,8 +420,8 @@ class TlsGate:
         return await self._connect(outside, caller, address, task)
 
     async def _connect(self, outside: PipeEnd, caller: Caller, address: str, task: asyncio.Task[None]) -> bool:
-        if len(self._connections) >= MAX_CONNECTIONS:
-            self._refused(address, TOO_MANY_CONNECTIONS, f"{MAX_CONNECTIONS} connections are open")
+        if len(self._connections) >= MAX_TLS_CONNECTIONS:
+            self._refused(address, TOO_MANY_CONNECTIONS, f"{MAX_TLS_CONNECTIONS} connections are open")
             outside.abort()
             return False
         if caller.refusal is None and caller.identity.role in _REGISTERS:
@@ -519,7 +522,7 @@ class TlsGate:
             return
         self._told[name, refusal.reason] = now
         self._told.move_to_end((name, refusal.reason))
-        if len(self._told) > MAX_TOLD:
+        if len(self._told) > MAX_LOGGED_REFUSALS:
             self._told.popitem(last=False)
         log.warning("refused a connection of %s: %s: %s", who, refusal.reason, refusal)
         self.on_member_refused(name, f"connection: {refusal}")

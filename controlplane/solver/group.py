@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 TELL_AGAIN_S = 60.0
-MAX_TOLD = 1024
+MAX_LOGGED_FAILURES = 1024
 """Failed blocks remembered with the time of their log line; beyond that all are forgotten and may be logged again."""
 
 SMALL_BLOCKS = 64
@@ -78,7 +78,7 @@ class FailureLog:
         """Log that solving this block raised."""
         if now - self._told.get(key, -math.inf) < TELL_AGAIN_S:
             return
-        if len(self._told) >= MAX_TOLD:
+        if len(self._told) >= MAX_LOGGED_FAILURES:
             self._told.clear()
         self._told[key] = now
         log.error("%s of %s could not be solved and keeps its mapping: %r", key.service, key.robot, error)

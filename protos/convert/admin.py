@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING
 from plr.protos.base.errors import DecodeError
 from plr.protos.convert.control import revocations_from_proto, revocations_to_proto
 from plr.protos.convert.fields import (
+    MAX_LISTED_SIDECARS,
     MAX_MAPPED_SERVICES,
     MAX_OFFERS,
-    MAX_SIDECARS,
     MAX_USES,
     duration,
     each,
@@ -31,7 +31,7 @@ from plr.protos.convert.types import (
 )
 from plr.protos.model.members import MAX_UNMET, NO_REVOCATIONS, RevocationSet
 from plr.protos.model.names import clean_text, node_name, text
-from plr.protos.model.report import MAX_PATHS
+from plr.protos.model.report import MAX_PATH_REPORTS
 from plr.protos.model.status import ResourceStatus, SidecarStatus, StatusQuery, SyncState
 from plr.protos.plr.v1 import admin_pb2
 
@@ -51,7 +51,7 @@ _SYNC_STATE_NUMBERS = {state: number for number, state in _SYNC_STATES.items()}
 
 def status_from_proto(message: admin_pb2.GetStatusResponse) -> tuple[SidecarStatus, ...]:
     """Check the status of all sidecars."""
-    return each(message.sidecars, MAX_SIDECARS, "sidecars", _sidecar_from_proto)
+    return each(message.sidecars, MAX_LISTED_SIDECARS, "sidecars", _sidecar_from_proto)
 
 
 def own_revocations_from_proto(message: admin_pb2.GetStatusResponse) -> RevocationSet:
@@ -68,8 +68,8 @@ def status_to_proto(
 
 def status_query_from_proto(message: admin_pb2.StreamStatusRequest) -> StatusQuery:
     """Check a query for the status."""
-    if len(message.names) > MAX_SIDECARS:
-        raise DecodeError(f"names has {len(message.names)} elements, more than {MAX_SIDECARS}")
+    if len(message.names) > MAX_LISTED_SIDECARS:
+        raise DecodeError(f"names has {len(message.names)} elements, more than {MAX_LISTED_SIDECARS}")
     unique(message.names, "names")
     return StatusQuery(tuple(node_name(name, "names") for name in message.names), message.detailed_at_most)
 
@@ -89,7 +89,7 @@ def _sidecar_from_proto(message: admin_pb2.SidecarStatus) -> SidecarStatus:
         peers=resource_from_proto(message.peers),
         mapping=resource_from_proto(message.mapping),
         services=each(message.services, MAX_MAPPED_SERVICES, "services", service_mapping_from_proto),
-        paths=each(message.paths, MAX_PATHS, "paths", path_from_proto),
+        paths=each(message.paths, MAX_PATH_REPORTS, "paths", path_from_proto),
         refused_offers=service_names(message.refused_offers, MAX_OFFERS, "refused_offers"),
         revocations=revocations_from_proto(message.revocations),
         unmet=service_names(message.unmet, MAX_UNMET, "unmet"),

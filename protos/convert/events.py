@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from plr.protos.convert.fields import MAX_DURATION_S, MAX_EVENTS, US_PER_S, at_most, each, known, microseconds
+from plr.protos.convert.fields import MAX_DURATION_S, MAX_REPORTED_COUNT, US_PER_S, at_most, each, known, microseconds
 from plr.protos.convert.types import role_from_proto, role_to_proto, service_names
 from plr.protos.model.fleet_events import (
     DepartedSidecar,
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 MAX_FLEET_EVENTS = 65_536
 """Events in one answer."""
 
-MAX_DEPARTED = 8192
+MAX_LISTED_DEPARTED = 8192
 """Departed sidecars in one status."""
 
 MAX_SERVICES = 1024
@@ -84,7 +84,7 @@ def event_list_from_proto(message: admin_pb2.ListEventsResponse) -> EventList:
     """Check the answer to a query for events."""
     return EventList(
         events=events_from_proto(message.events),
-        left_out=at_most(message.left_out, MAX_EVENTS, "left_out"),
+        left_out=at_most(message.left_out, MAX_REPORTED_COUNT, "left_out"),
         log=log_state_from_proto(message.log),
     )
 
@@ -133,7 +133,7 @@ def why_to_proto(why: Why | None) -> admin_pb2.DepartureReason.ValueType:
 
 def departed_from_proto(messages: Sequence[admin_pb2.DepartedSidecar]) -> tuple[DepartedSidecar, ...]:
     """Check the departed sidecars."""
-    return each(messages, MAX_DEPARTED, "departed", _departed_from_proto)
+    return each(messages, MAX_LISTED_DEPARTED, "departed", _departed_from_proto)
 
 
 def _departed_from_proto(message: admin_pb2.DepartedSidecar) -> DepartedSidecar:
@@ -166,11 +166,11 @@ def departed_to_proto(gone: DepartedSidecar) -> admin_pb2.DepartedSidecar:
 def log_state_from_proto(message: admin_pb2.EventLogState) -> EventLogState:
     """Check the state of the event log."""
     return EventLogState(
-        kept=at_most(message.kept, MAX_EVENTS, "kept"),
-        evicted=at_most(message.evicted, MAX_EVENTS, "evicted"),
-        too_often=at_most(message.too_often, MAX_EVENTS, "too_often"),
-        damaged=at_most(message.damaged, MAX_EVENTS, "damaged"),
-        write_failures=at_most(message.write_failures, MAX_EVENTS, "write_failures"),
+        kept=at_most(message.kept, MAX_REPORTED_COUNT, "kept"),
+        evicted=at_most(message.evicted, MAX_REPORTED_COUNT, "evicted"),
+        too_often=at_most(message.too_often, MAX_REPORTED_COUNT, "too_often"),
+        damaged=at_most(message.damaged, MAX_REPORTED_COUNT, "damaged"),
+        write_failures=at_most(message.write_failures, MAX_REPORTED_COUNT, "write_failures"),
         on_disk=message.on_disk,
         problem=text(message.problem, "problem"),
     )

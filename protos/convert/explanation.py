@@ -11,7 +11,7 @@ from plr.protos.convert.events import why_from_proto, why_to_proto
 from plr.protos.convert.fields import (
     MAX_ASSIGNMENTS,
     MAX_DURATION_S,
-    MAX_EVENTS,
+    MAX_REPORTED_COUNT,
     US_PER_S,
     at_most,
     duration,
@@ -45,13 +45,13 @@ from plr.protos.plr.v1 import admin_pb2
 if TYPE_CHECKING:
     from plr.protos.model.ids import NodeName, ServiceName
 
-MAX_PAIRS = 4096
+MAX_LISTED_PAIRS = 4096
 """Pairs in one explanation."""
 
 MAX_ALTERNATIVES = 1024
 """Other mappings in one explanation."""
 
-MAX_CHANGES = 64
+MAX_LISTED_CHANGES = 64
 """Past mappings in one explanation."""
 
 MAX_SHARED = 16
@@ -97,11 +97,11 @@ def explanation_from_proto(message: admin_pb2.ExplainResponse) -> Explanation:
         observed_miss=_optional(message, "observed_miss"),
         target_miss=probability(message.target_miss, "target_miss"),
         cost_per_request=_cost_per_request(message),
-        pairs=each(message.pairs, MAX_PAIRS, "pairs", _pair_from_proto),
-        pairs_left_out=at_most(message.pairs_left_out, MAX_EVENTS, "pairs_left_out"),
+        pairs=each(message.pairs, MAX_LISTED_PAIRS, "pairs", _pair_from_proto),
+        pairs_left_out=at_most(message.pairs_left_out, MAX_REPORTED_COUNT, "pairs_left_out"),
         joints=each(message.joints, MAX_JOINTS, "joints", _joint_from_proto),
         alternatives=each(message.alternatives, MAX_ALTERNATIVES, "alternatives", _alternative_from_proto),
-        changes=each(message.changes, MAX_CHANGES, "changes", _change_from_proto),
+        changes=each(message.changes, MAX_LISTED_CHANGES, "changes", _change_from_proto),
         gone_s=_age(message.gone_us, "gone_us") if message.HasField("gone_us") else None,
         gone_why=why_from_proto(message.gone_reason) if message.HasField("gone_us") else None,
     )
@@ -147,8 +147,8 @@ def _age(age_us: int, field: str) -> float:
 
 
 def _weight(value: float, field: str) -> float:
-    if not (math.isfinite(value) and 0.0 <= value <= MAX_EVENTS):
-        raise DecodeError(f"{field} {value} is not within 0..{MAX_EVENTS}")
+    if not (math.isfinite(value) and 0.0 <= value <= MAX_REPORTED_COUNT):
+        raise DecodeError(f"{field} {value} is not within 0..{MAX_REPORTED_COUNT}")
     return value
 
 
@@ -183,7 +183,7 @@ def _pair_from_proto(message: admin_pb2.ExplainedPair) -> PairExplanation:
         busiest_witness=node_name(message.busiest_witness, "busiest_witness") if message.busiest_witness else None,
         busiest_share=probability(message.busiest_share, "busiest_share"),
         penalty_s=duration(message.penalty_us, "penalty_us", zero=True),
-        bad_answers=at_most(message.bad_answers, MAX_EVENTS, "bad_answers"),
+        bad_answers=at_most(message.bad_answers, MAX_REPORTED_COUNT, "bad_answers"),
     )
 
 

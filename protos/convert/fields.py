@@ -40,13 +40,13 @@ MAX_CRL_BYTES = 1 << 20
 MAX_STUN_SERVERS = 16
 """STUN servers in one welcome."""
 
-MAX_SIDECARS = 8192
+MAX_LISTED_SIDECARS = 8192
 """Sidecars in one status."""
 
 MAX_DURATION_S = 86_400.0
 """Longest deadline, lease or interval: one day. Anything longer is a unit mistake."""
 
-MAX_EVENTS = 1 << 53
+MAX_REPORTED_COUNT = 1 << 53
 """Largest count of datagrams or requests in one report: the largest that a float holds exactly."""
 
 MAX_CAPACITY = 1_000_000
@@ -55,7 +55,7 @@ MAX_CAPACITY = 1_000_000
 MAX_COST_PER_REQUEST = 1e9
 """Largest cost of a request over an interface or at a server; a larger one is a mistake."""
 
-MAX_COPIES = 256
+MAX_MAPPED_COPIES = 256
 """Copies of one request: as many as a robot can have interfaces."""
 
 US_PER_S = 1_000_000

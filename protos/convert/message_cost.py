@@ -9,7 +9,7 @@ from __future__ import annotations
 from plr.protos.base.errors import DecodeError
 from plr.protos.convert.fields import MAX_CANDIDATES, MAX_OFFERS, MAX_OUTCOMES, MAX_USES
 from plr.protos.model.members import MAX_UNMET
-from plr.protos.model.report import MAX_GOODBYES, MAX_JOINTS, MAX_LATENCIES, MAX_PATHS, MAX_PENALTIES
+from plr.protos.model.report import MAX_GOODBYES, MAX_JOINTS, MAX_LATENCIES, MAX_PATH_REPORTS, MAX_PENALTIES
 from plr.protos.plr.v1 import control_pb2
 from plr.protos.trust.identity import MAX_CA_CERTIFICATES
 
@@ -24,7 +24,7 @@ _NAMES = {field.number: field.name for field in control_pb2.SidecarMessage.DESCR
 _ELEMENTS = {
     "candidates": 3 * MAX_CANDIDATES,
     "services": MAX_OFFERS + MAX_USES + 3 * MAX_UNMET,
-    "report": MAX_LATENCIES + MAX_PATHS + MAX_OUTCOMES + 2 * MAX_JOINTS + MAX_PENALTIES + MAX_GOODBYES,
+    "report": MAX_LATENCIES + MAX_PATH_REPORTS + MAX_OUTCOMES + 2 * MAX_JOINTS + MAX_PENALTIES + MAX_GOODBYES,
     "revocations": MAX_CA_CERTIFICATES,
 }
 """Most elements in all lists of a message of this kind; other kinds have none."""

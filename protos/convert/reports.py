@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 from plr.protos.base.errors import DecodeError
 from plr.protos.base.size_class import SIZE_CLASSES
 from plr.protos.convert.fields import (
-    MAX_EVENTS,
     MAX_OUTCOMES,
+    MAX_REPORTED_COUNT,
     at_most,
     check_length,
     duration,
@@ -24,7 +24,7 @@ from plr.protos.model.report import (
     MAX_GOODBYES,
     MAX_JOINTS,
     MAX_LATENCIES,
-    MAX_PATHS,
+    MAX_PATH_REPORTS,
     MAX_PENALTIES,
     InterfaceJointReport,
     JointReport,
@@ -53,7 +53,7 @@ def report_from_proto(message: control_pb2.Report) -> Report:
         raise DecodeError(f"goodbyes has {len(message.goodbyes)} elements, more than {MAX_GOODBYES}")
     return Report(
         latencies=each(message.latencies, MAX_LATENCIES, "latencies", _latency_from_proto),
-        paths=each(message.paths, MAX_PATHS, "paths", path_from_proto),
+        paths=each(message.paths, MAX_PATH_REPORTS, "paths", path_from_proto),
         outcomes=each(message.outcomes, MAX_OUTCOMES, "outcomes", _outcome_from_proto),
         joints=each(message.joints, MAX_JOINTS, "joints", _joint_from_proto),
         interface_joints=each(message.interface_joints, MAX_JOINTS, "interface_joints", _interface_joint_from_proto),
@@ -70,7 +70,7 @@ def report_parts(message: control_pb2.Report) -> Iterator[Report]:
     """
     lists: tuple[tuple[str, int], ...] = (
         *(("outcomes", MAX_OUTCOMES), ("latencies", MAX_LATENCIES), ("joints", MAX_JOINTS)),
-        *(("interface_joints", MAX_JOINTS), ("paths", MAX_PATHS)),
+        *(("interface_joints", MAX_JOINTS), ("paths", MAX_PATH_REPORTS)),
     )
     for field, limit in lists:
         check_length(getattr(message, field), limit, field)
@@ -109,7 +109,7 @@ def report_to_proto(report: Report) -> control_pb2.Report:
 
 
 def _latency_from_proto(message: control_pb2.LatencyReport) -> LatencyReport:
-    requests = at_most(message.requests, MAX_EVENTS, "requests")
+    requests = at_most(message.requests, MAX_REPORTED_COUNT, "requests")
     return LatencyReport(
         interface=interface_name(message.interface, "interface"),
         server=node_name(message.server, "server"),
@@ -144,8 +144,8 @@ def path_from_proto(message: control_pb2.PathReport) -> PathReport:
         server=node_name(message.server, "server"),
         up=message.up,
         rtt=histogram_from_proto(message.rtt),
-        datagrams_sent=at_most(message.datagrams_sent, MAX_EVENTS, "datagrams_sent"),
-        datagrams_lost=at_most(message.datagrams_lost, MAX_EVENTS, "datagrams_lost"),
+        datagrams_sent=at_most(message.datagrams_sent, MAX_REPORTED_COUNT, "datagrams_sent"),
+        datagrams_lost=at_most(message.datagrams_lost, MAX_REPORTED_COUNT, "datagrams_lost"),
     )
 
 
@@ -164,9 +164,9 @@ def path_to_proto(path: PathReport) -> control_pb2.PathReport:
 def _outcome_from_proto(message: control_pb2.OutcomeReport) -> OutcomeReport:
     return OutcomeReport(
         service=service_name(message.service, "service"),
-        ok=at_most(message.ok, MAX_EVENTS, "ok"),
-        deadline_missed=at_most(message.deadline_missed, MAX_EVENTS, "deadline_missed"),
-        failed=at_most(message.failed, MAX_EVENTS, "failed"),
+        ok=at_most(message.ok, MAX_REPORTED_COUNT, "ok"),
+        deadline_missed=at_most(message.deadline_missed, MAX_REPORTED_COUNT, "deadline_missed"),
+        failed=at_most(message.failed, MAX_REPORTED_COUNT, "failed"),
     )
 
 
@@ -180,7 +180,7 @@ def _penalty_from_proto(message: control_pb2.PenaltyReport) -> PenaltyReport:
     return PenaltyReport(
         server=node_name(message.server, "server"),
         left_s=duration(message.left_us, "left_us", zero=True),
-        bad_answers=at_most(message.bad_answers, MAX_EVENTS, "bad_answers"),
+        bad_answers=at_most(message.bad_answers, MAX_REPORTED_COUNT, "bad_answers"),
     )
 
 
@@ -194,7 +194,7 @@ def _joint_from_proto(message: control_pb2.JointReport) -> JointReport:
     first, second = assignment_from_proto(message.first), assignment_from_proto(message.second)
     if not (first.interface, first.server) < (second.interface, second.server):
         raise DecodeError("joints: the first path does not come before the second")
-    requests = at_most(message.requests, MAX_EVENTS, "requests")
+    requests = at_most(message.requests, MAX_REPORTED_COUNT, "requests")
     return JointReport(
         service=service_name(message.service, "service"),
         first=first,
@@ -218,7 +218,7 @@ def _interface_joint_from_proto(message: control_pb2.InterfaceJointReport) -> In
     first, second = interface_name(message.first, "first"), interface_name(message.second, "second")
     if not first < second:
         raise DecodeError("interface_joints: the first interface does not come before the second")
-    requests = at_most(message.requests, MAX_EVENTS, "requests")
+    requests = at_most(message.requests, MAX_REPORTED_COUNT, "requests")
     both_missed = at_most(message.both_missed, requests, "both_missed")
     races = at_most(message.races, requests, "races")
     only_first_missed = at_most(message.only_first_missed, min(races, requests - both_missed), "only_first_missed")

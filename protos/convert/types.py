@@ -11,7 +11,7 @@ from plr.protos.base.histogram import BUCKETS, LAYOUT, Histogram
 from plr.protos.convert.fields import (
     MAX_CANDIDATES,
     MAX_CAPACITY,
-    MAX_COPIES,
+    MAX_MAPPED_COPIES,
     MAX_OFFERS,
     at_most,
     cost,
@@ -220,8 +220,8 @@ def use_from_proto(message: types_pb2.ServiceUse) -> ServiceUse:
 
 
 def _copies_from_proto(message: types_pb2.ServiceUse) -> Copies:
-    least = at_most(message.least_copies, MAX_COPIES, "least_copies")
-    most = at_most(message.most_copies, MAX_COPIES, "most_copies")
+    least = at_most(message.least_copies, MAX_MAPPED_COPIES, "least_copies")
+    most = at_most(message.most_copies, MAX_MAPPED_COPIES, "most_copies")
     if most and not 1 <= least <= most:
         raise DecodeError(f"least_copies {least} is not within 1..{most}, the most")
     return Copies(least, most)

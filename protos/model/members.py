@@ -81,8 +81,12 @@ MAX_CANDIDATES_OF_INTERFACE = 8
 """Addresses at which peers look for one interface: IPv4, some IPv6, the NAT mapping of each, one advertised."""
 
 
-MAX_PEERS = 4096
-"""Peers of one sidecar: as many sidecars as a control plane registers."""
+MAX_SIDECARS = 4096
+"""Sidecars that a control plane knows at once. A further one is refused, not let in for another."""
+
+
+MAX_PEERS = MAX_SIDECARS
+"""Peers of one sidecar."""
 
 
 MAX_UNMET = 64

@@ -18,7 +18,7 @@ MAX_LATENCIES = 4096
 """Pairs (interface, server) in one report, counted separately for each service and size class that they carried."""
 
 
-MAX_PATHS = 4096
+MAX_PATH_REPORTS = 4096
 """Paths (interface, server) in one report."""
 
 

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, NoReturn, TypeVar
 
 from plr.protos.base.errors import DecodeError
 from plr.protos.base.printable import escaped
+from plr.protos.program.exit_codes import EXIT_USAGE
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -14,8 +15,6 @@ if TYPE_CHECKING:
     Commands = argparse._SubParsersAction["OneLineParser"]
 
 N = TypeVar("N")
-
-EXIT_USAGE = 2
 
 
 class OneLineParser(argparse.ArgumentParser):

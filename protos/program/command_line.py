@@ -12,6 +12,7 @@ from importlib.metadata import entry_points
 from typing import TYPE_CHECKING
 
 from plr.protos.program import endings, extras
+from plr.protos.program.exit_codes import EXIT_FAILED
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -19,7 +20,6 @@ if TYPE_CHECKING:
 GROUP = "plr.commands"
 OPERATOR = "operator"
 """The entry point for all commands that have none of their own."""
-EXIT_FAILURE = 1
 
 
 @endings.ends_quietly("plr")
@@ -33,7 +33,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             run = commands[name].load()
     except KeyError:
         sys.stderr.write("plr: the installation is incomplete; do: pip install --force-reinstall fogros2-plr\n")
-        return EXIT_FAILURE
+        return EXIT_FAILED
     code: int = run(given if name == OPERATOR else given[1:])
     return code
 

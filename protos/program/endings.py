@@ -12,16 +12,13 @@ import sys
 import threading
 from typing import TYPE_CHECKING, ParamSpec
 
+from plr.protos.program.exit_codes import EXIT_FAILED, EXIT_INTERRUPTED, EXIT_NO_READER
+
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
 P = ParamSpec("P")
 
-EXIT_FAILURE = 1
-EXIT_NO_READER = 128 + signal.SIGPIPE
-"""Exit code that the shell reports for a program ended by SIGPIPE, ..."""
-EXIT_INTERRUPTED = 128 + signal.SIGINT
-"""... or by Ctrl-C."""
 _STDERR = 2
 _NO_ROOM = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO})
 
@@ -50,7 +47,7 @@ def ends_quietly(name: str) -> Callable[[Callable[P, int]], Callable[P, int]]:
                     raise
                 print_no_more()
                 sys.stderr.write(f"{name}: its output cannot be written: {error.strerror}\n")
-                return EXIT_FAILURE
+                return EXIT_FAILED
 
         return run
 

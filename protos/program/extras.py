@@ -8,6 +8,7 @@ import sys
 from typing import TYPE_CHECKING
 
 from plr.protos.program.endings import ended_by_ctrl_c
+from plr.protos.program.exit_codes import EXIT_USAGE
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
@@ -17,7 +18,6 @@ SIDECAR = ("prometheus_client", "pyroute2", "sdnotify", "zfec")
 CONTROL_PLANE = ("grpc_health", "grpc_reflection", "numpy", "ortools", "prometheus_client", "sdnotify")
 PLAN = ("numpy",)
 
-EXIT_MISSING = 2
 _OURS = "plr"
 
 
@@ -43,4 +43,4 @@ def required(program: str, extra: str) -> Iterator[None]:
         if not name or name == _OURS:
             raise
         sys.stderr.write(f"{program}: {advice(extra, [name])}\n")
-        sys.exit(EXIT_MISSING)
+        sys.exit(EXIT_USAGE)

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-MAX_CONNECTIONS = 16
+MAX_SCRAPES = 16
 """Scrapes at once; further connections are closed unread."""
 TIMEOUT_S = 5.0
 """Limit for each read and write; a scraper over a slow network takes less."""
@@ -38,11 +38,11 @@ class _Handler(WSGIRequestHandler):
 
 class _Server(ThreadingMixIn, WSGIServer):
     daemon_threads = True
-    request_queue_size = MAX_CONNECTIONS
+    request_queue_size = MAX_SCRAPES
 
     def __init__(self, host: str, port: int) -> None:
         self.address_family = socket.AF_INET6 if ":" in host else socket.AF_INET
-        self._room = threading.BoundedSemaphore(MAX_CONNECTIONS)
+        self._room = threading.BoundedSemaphore(MAX_SCRAPES)
         super().__init__((host, port), _Handler)
 
     def process_request(self, request: Any, client_address: Any) -> None:

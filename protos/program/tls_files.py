@@ -36,7 +36,7 @@ CRL_FILE = "crl.pem"
 POLL_INTERVAL_S = 0.25
 """How often to look for changes: a revocation must take effect within a second."""
 
-MAX_FILE_BYTES = 4 << 20
+MAX_TLS_FILE_BYTES = 4 << 20
 """A revocation list of some 50,000 certificates; a larger file is something else."""
 
 KEY_FORBIDDEN = stat.S_IRWXO | stat.S_IWGRP
@@ -150,7 +150,7 @@ def _read(path: Path, forbidden: int) -> bytes:
         raise
 
 
-def read_guarded(path: Path, forbidden: int, *, most: int = MAX_FILE_BYTES) -> bytes:
+def read_guarded(path: Path, forbidden: int, *, most: int = MAX_TLS_FILE_BYTES) -> bytes:
     """Return the file's content, at most `most` bytes; raise ConfigError, also for any `forbidden` permission."""
     try:
         with open_regular(path) as file:

@@ -55,10 +55,10 @@ HEADER_BYTES = 20
 TRANSACTION_ID_BYTES = 12
 BINDING_METHOD = 0x001
 
-MAX_MESSAGE_BYTES = 1500
+MAX_STUN_BYTES = 1500
 """Longest message to decode: one Ethernet MTU. RFC 8489 section 6.1 keeps messages below the path MTU."""
 
-MAX_TEXT_BYTES = 763
+MAX_STUN_TEXT_BYTES = 763
 """Longest SOFTWARE and reason phrase (RFC 8489 sections 14.14 and 14.8: 127 characters in UTF-8)."""
 
 MAX_TEXT_CHARACTERS = 127
@@ -149,8 +149,8 @@ def encode(message: StunMessage) -> bytes:
     if message.software is not None:
         body += _encode_attribute(Attribute.SOFTWARE, _text_value(message.software))
     length = len(body) + (_FINGERPRINT_BYTES if message.fingerprint else 0)
-    if HEADER_BYTES + length > MAX_MESSAGE_BYTES:
-        raise ValueError(f"message has {HEADER_BYTES + length} bytes, at most {MAX_MESSAGE_BYTES} allowed")
+    if HEADER_BYTES + length > MAX_STUN_BYTES:
+        raise ValueError(f"message has {HEADER_BYTES + length} bytes, at most {MAX_STUN_BYTES} allowed")
     kind = _message_type(message.message_class)
     data = _HEADER.pack(kind, length, MAGIC_COOKIE, message.transaction_id) + bytes(body)
     if message.fingerprint:
@@ -163,8 +163,8 @@ def decode(data: bytes | memoryview) -> StunMessage:
     data = bytes(data)
     if len(data) < HEADER_BYTES:
         raise DecodeError(f"STUN: {len(data)} bytes, a header has {HEADER_BYTES}")
-    if len(data) > MAX_MESSAGE_BYTES:
-        raise DecodeError(f"STUN: {len(data)} bytes, at most {MAX_MESSAGE_BYTES} allowed")
+    if len(data) > MAX_STUN_BYTES:
+        raise DecodeError(f"STUN: {len(data)} bytes, at most {MAX_STUN_BYTES} allowed")
     kind, length, cookie, transaction_id = _HEADER.unpack_from(data)
     if kind & 0xC000 or cookie != MAGIC_COOKIE:
         raise DecodeError("STUN: first two bits are not 0, or no magic cookie")
@@ -270,7 +270,7 @@ def _read_error(value: bytes | None) -> tuple[int | None, str]:
 
 def _text_value(text: str) -> bytes:
     value = text.encode()
-    if len(text) > MAX_TEXT_CHARACTERS or len(value) > MAX_TEXT_BYTES:
+    if len(text) > MAX_TEXT_CHARACTERS or len(value) > MAX_STUN_TEXT_BYTES:
         raise ValueError(f"text of {len(text)} characters, at most {MAX_TEXT_CHARACTERS} allowed")
     return value
 
@@ -278,8 +278,8 @@ def _text_value(text: str) -> bytes:
 def _read_text(value: bytes | None) -> str | None:
     if value is None:
         return None
-    if len(value) > MAX_TEXT_BYTES:
-        raise DecodeError(f"STUN: text of {len(value)} bytes, at most {MAX_TEXT_BYTES} allowed")
+    if len(value) > MAX_STUN_TEXT_BYTES:
+        raise DecodeError(f"STUN: text of {len(value)} bytes, at most {MAX_STUN_TEXT_BYTES} allowed")
     # The text ends up in logs, where a stranger's bytes must not forge lines or move a terminal's cursor.
     return "".join(c if c.isprintable() else "\ufffd" for c in value.decode(errors="replace"))
 

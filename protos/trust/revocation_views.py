@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from plr.protos.trust.identity import RevocationList
 
 
-MAX_NUMBER = (1 << 64) - 1
+MAX_LIST_NUMBER = (1 << 64) - 1
 """Largest number that fits in a message; a list's number may be longer (RFC 5280 section 5.2.3)."""
 
 
@@ -49,6 +49,8 @@ def revocation_gauges(lists: Mapping[int, RevocationList | None], now_wall: floa
 def revocation_set(lists: Mapping[int, RevocationList | None], too_old: int = 0) -> RevocationSet:
     """Return what to report about these lists; `too_old` is the number of CAs whose list is too old."""
     held = [
-        HeldList(ca, min(one.number, MAX_NUMBER), int(one.signed_at)) for ca, one in lists.items() if one is not None
+        HeldList(ca, min(one.number, MAX_LIST_NUMBER), int(one.signed_at))
+        for ca, one in lists.items()
+        if one is not None
     ]
     return RevocationSet(tuple(held), too_old)

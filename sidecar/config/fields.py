@@ -10,7 +10,7 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field, PlainValidato
 
 from plr.protos.base.errors import DecodeError
 from plr.protos.base.host_port import check_remote
-from plr.protos.convert.fields import MAX_COPIES
+from plr.protos.convert.fields import MAX_MAPPED_COPIES
 from plr.protos.model.members import AT_MOST_EVERY_INTERFACE, EVERY_INTERFACE, Copies
 from plr.protos.model.names import domain_label, node_name
 from plr.protos.program.config_fields import REMOTE_ADDRESS, encoded_path, refuse_duplicates, text_of
@@ -114,9 +114,9 @@ def _check_copies(value: object) -> Copies:
         return value
     if isinstance(value, str) and value in _COPIES_WORDS:
         return _COPIES_WORDS[value]
-    if isinstance(value, int) and not isinstance(value, bool) and 1 <= value <= MAX_COPIES:
+    if isinstance(value, int) and not isinstance(value, bool) and 1 <= value <= MAX_MAPPED_COPIES:
         return Copies(value, value)
-    raise ValueError(f"expected each, at_most or a number from 1 to {MAX_COPIES}, got {value!r}")
+    raise ValueError(f"expected each, at_most or a number from 1 to {MAX_MAPPED_COPIES}, got {value!r}")
 
 
 # A YAML list becomes a tuple, a word an enum; strict mode would refuse both. The items of a list stay strict.
@@ -190,6 +190,6 @@ CopiesWanted = Annotated[
     Copies,
     PlainValidator(_check_copies),
     WithJsonSchema(
-        {"anyOf": [{"enum": [*_COPIES_WORDS]}, {"type": "integer", "minimum": 1, "maximum": MAX_COPIES}]},
+        {"anyOf": [{"enum": [*_COPIES_WORDS]}, {"type": "integer", "minimum": 1, "maximum": MAX_MAPPED_COPIES}]},
     ),
 ]

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-MAX_HEARD = 16
+MAX_UNJUDGED_LISTS = 16
 """Peers' lists that may wait to be judged, which happens every second; the exchange asks for one every 5 s."""
 CLOCK_SLACK_S = 300.0
 """A list signed this much later than now shows that this clock is behind; certificates are backdated by as much."""
@@ -90,8 +90,8 @@ class Revocations:
 
     def heard(self, peer: NodeName, pem: bytes) -> None:
         """Queue lists that a peer sent; `look` judges them."""
-        if len(self._heard) == MAX_HEARD:
-            log.warning("a revocation list is dropped unread: %d others already wait to be checked", MAX_HEARD)
+        if len(self._heard) == MAX_UNJUDGED_LISTS:
+            log.warning("a revocation list is dropped unread: %d others already wait to be checked", MAX_UNJUDGED_LISTS)
             return
         self._heard.append((peer, pem))
 

@@ -36,6 +36,7 @@ from plr.protos.base.host_port import split_host_port
 from plr.protos.base.printable import escaped
 from plr.protos.program import commit
 from plr.protos.program.config_file import parse_yaml, read_text
+from plr.protos.program.exit_codes import EXIT_FAILED, EXIT_OK
 from plr.sidecar.config.sidecar import SidecarConfig
 from plr.sidecar.doctor.command import as_json, as_text
 from plr.sidecar.doctor.examination import examine
@@ -47,8 +48,6 @@ if TYPE_CHECKING:
 
     from plr.sidecar.doctor.examination import Examination, Where
 
-EXIT_OK = 0
-EXIT_FAILURE = 1
 MAX_PART_BYTES = 8 << 20
 """Limit of each file; a longer one loses its middle."""
 COMMAND_S = 15.0
@@ -89,7 +88,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         write(output, stem, seen, where)
     except OSError as error:
         sys.stderr.write(escaped(f"plr bugreport: {output} cannot be written: {error.strerror or error}") + "\n")
-        return EXIT_FAILURE
+        return EXIT_FAILED
     sys.stdout.write(escaped(f"{output}: read it before you publish it: tar tzf {output}") + "\n")
     return EXIT_OK
 

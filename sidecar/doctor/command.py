@@ -19,6 +19,7 @@ from collections import Counter
 from typing import TYPE_CHECKING, Any
 
 from plr.protos.base.printable import escaped
+from plr.protos.program.exit_codes import EXIT_NO, EXIT_OK
 from plr.sidecar.doctor.examination import examine
 from plr.sidecar.doctor.finding import Level
 from plr.sidecar.doctor.options import parser_of, where_of
@@ -29,9 +30,6 @@ if TYPE_CHECKING:
     from plr.sidecar.doctor.examination import Examination
     from plr.sidecar.doctor.finding import Finding
 
-EXIT_OK = 0
-EXIT_FAILURE = 1
-
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run `plr doctor` and return its exit code."""
@@ -41,7 +39,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = parser.parse_args(arguments)
     seen = examine(where_of(options), pinging=not options.no_ping)
     sys.stdout.write(as_json(seen) if options.json else as_text(seen.findings))
-    return EXIT_FAILURE if any(one.level is Level.FAIL for one in seen.findings) else EXIT_OK
+    return EXIT_NO if any(one.level is Level.FAIL for one in seen.findings) else EXIT_OK
 
 
 def as_text(findings: Iterable[Finding]) -> str:

@@ -22,11 +22,11 @@ from plr.sidecar.doctor import host, node_checks, running_checks
 from plr.sidecar.doctor.finding import fail, ok, warn
 from plr.sidecar.doctor.running_checks import Pinged
 from plr.sidecar.local.client import LocalBusyError, LocalClient, LocalError, LocalRefusedError
-from plr.sidecar.local.protocol import MAX_REQUESTS
+from plr.sidecar.local.protocol import MAX_REQUESTS_OF_CONNECTION
 from plr.sidecar.net.interfaces import choose, list_interfaces
 from plr.sidecar.ros import environment
 from plr.sidecar.ros.errors import RosBridgeError
-from plr.sidecar.state.file import MAX_FILE_BYTES, decode_clock_floor, decode_last_good
+from plr.sidecar.state.file import MAX_STATE_FILE_BYTES, decode_clock_floor, decode_last_good
 from plr.sidecar.state.store import CLOCK_FILE, LAST_GOOD_FILE
 
 if TYPE_CHECKING:
@@ -246,7 +246,7 @@ def _is_for_others(error: ConfigError) -> bool:
 def _read_state(path: Path, decode: Callable[[bytes], T]) -> T | None:
     """Return the content of a file of the state folder if it exists, is readable for this user, and is valid."""
     try:
-        return decode(read_regular(path, MAX_FILE_BYTES))
+        return decode(read_regular(path, MAX_STATE_FILE_BYTES))
     except (OSError, DecodeError):
         return None
 
@@ -347,8 +347,8 @@ def _ping_all(client: LocalClient, state: dict[str, Any]) -> dict[PathKey, Pinge
             for peer in peers:
                 if time.monotonic() > end:
                     return pings
-                # The sidecar answers MAX_REQUESTS at once, and may be slow with some.
-                _listen(client, asked, pings, PING_PATIENCE_S, until=MAX_REQUESTS - 1)
+                # The sidecar answers MAX_REQUESTS_OF_CONNECTION at once, and may be slow with some.
+                _listen(client, asked, pings, PING_PATIENCE_S, until=MAX_REQUESTS_OF_CONNECTION - 1)
                 asked[client.ping(peer, None, PING_BYTES)] = peer
             last = turn == PINGS - 1
             _listen(client, asked, pings, PING_PATIENCE_S if last else PING_EVERY_S, until=0 if last else -1)

@@ -25,6 +25,7 @@ from plr.protos.base.errors import ConfigError, DecodeError
 from plr.protos.base.printable import escaped
 from plr.protos.model.names import interface_name, node_name
 from plr.protos.program.arguments import checked, number, whole
+from plr.protos.program.exit_codes import EXIT_NO, EXIT_OK
 from plr.sidecar.core.link.pinging import LEAST_BYTES
 from plr.sidecar.core.wire.frame import MAX_DATAGRAM_BYTES
 from plr.sidecar.doctor.examination import connect, read_config
@@ -41,16 +42,14 @@ if TYPE_CHECKING:
     from plr.sidecar.doctor.examination import Where
     from plr.sidecar.local.client import LocalClient
 
-EXIT_OK = 0
-EXIT_NO_ANSWER = 1
 LEAST_INTERVAL_S = 0.1
 """The sidecar sends at most 20 pings a second over an interface."""
 DEFAULT_BYTES = 64
 MAX_INTERFACE_CHARACTERS = 15
 """Linux's limit."""
-MAX_PATHS = 4096
+MAX_PINGED_PATHS = 4096
 """Paths to one peer; more are not counted."""
-MAX_WAITING = 128
+MAX_AWAITED_TURNS = 128
 """Turns whose answers are awaited."""
 
 
@@ -137,18 +136,18 @@ class Pinger:
         elif line.get("end"):
             self._rounds.pop(request, None)
         elif line.get("part") == "pinged":
-            for one in line["value"][:MAX_PATHS]:
+            for one in line["value"][:MAX_PINGED_PATHS]:
                 self._pinged(turn, (one["interface"], one["remote"]))
         elif line.get("part") == "pong" and turn:
             self._pong(turn, line["value"])
 
     def _pinged(self, turn: int, key: tuple[str, int]) -> None:
-        if len(self.tallies) >= MAX_PATHS and key not in self.tallies:
+        if len(self.tallies) >= MAX_PINGED_PATHS and key not in self.tallies:
             return
         tally = self.tallies.setdefault(key, PathTally())
         if turn and turn not in tally.waiting:
             tally.asked += 1
-            tally.waiting = {one for one in tally.waiting if one > turn - MAX_WAITING} | {turn}
+            tally.waiting = {one for one in tally.waiting if one > turn - MAX_AWAITED_TURNS} | {turn}
 
     def _pong(self, turn: int, pong: dict[str, Any]) -> None:
         key = pong["interface"], pong["remote"]
@@ -204,7 +203,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             return _ping(client, options)
     except LocalError as error:
         sys.stderr.write(f"plr ping: {error}\n")
-        return EXIT_NO_ANSWER
+        return EXIT_NO
 
 
 def _interface(name: str, what: str) -> InterfaceName:
@@ -250,8 +249,8 @@ def _ping(client: LocalClient, options: argparse.Namespace) -> int:
         say(f"{pinger.refused} requests were refused: the sidecar was busy with others")
     if ended is not None:
         sys.stderr.write(f"plr ping: {ended}\n")
-        return EXIT_NO_ANSWER
-    return EXIT_OK if any(tally.rtts_s for tally in pinger.tallies.values()) else EXIT_NO_ANSWER
+        return EXIT_NO
+    return EXIT_OK if any(tally.rtts_s for tally in pinger.tallies.values()) else EXIT_NO
 
 
 def _figures(pinger: Pinger) -> list[dict[str, Any]]:

@@ -26,7 +26,7 @@ SEARCHED_S = 60.0
 """The search for a path's MTU is over after this long."""
 STARTED_S = 20.0
 """Peers are known and probed within this time after the start."""
-MAX_GONE = 8
+MAX_SHOWN_GONE = 8
 """Lines about nodes that are no longer peers."""
 GOODBYE = "peer closed"
 """Reason for a path going down when its node ended in order."""
@@ -240,7 +240,7 @@ def gone(state: State) -> Iterator[Finding]:
     left = {
         peer: ones for peer, ones in _by(state.get("gone") or (), lambda one: one["peer"]).items() if peer not in now
     }
-    for name, ones in list(left.items())[:MAX_GONE]:
+    for name, ones in list(left.items())[:MAX_SHOWN_GONE]:
         since = duration(min(one["since_s"] for one in ones))
         reasons = sorted({one["reason"] for one in ones})
         if reasons == [GOODBYE]:
@@ -251,8 +251,8 @@ def gone(state: State) -> Iterator[Finding]:
             f"{name}: gone for {since}: {', '.join(reasons)} over {_over(ones)}; it is no longer a peer",
             f"check that the host of {name} is up and its sidecar runs; plr status shows when and why it left",
         )
-    if len(left) > MAX_GONE:
-        yield ok("peer", f"{len(left) - MAX_GONE} more nodes were peers within the last hour")
+    if len(left) > MAX_SHOWN_GONE:
+        yield ok("peer", f"{len(left) - MAX_SHOWN_GONE} more nodes were peers within the last hour")
 
 
 def _path(path: Mapping[str, Any], pinged: Pinged | None) -> Finding:

@@ -12,7 +12,7 @@ import re
 from typing import Any
 
 LEFT_OUT = "(left out)"
-MAX_LINE = 2000
+MAX_SCRUBBED_CHARACTERS = 2000
 """Maximum length of a line in characters; no useful line is longer."""
 MAX_VALUE_LINES = 100
 """Maximum number of lines of a secret in brackets or quotes."""
@@ -47,7 +47,7 @@ _MAX_ODD = 8
 
 
 def scrubbed(text: str) -> str:
-    """Return the text with lines of at most MAX_LINE characters, without anything that is or is called a secret."""
+    """Return the text without anything that is or is called a secret, in lines of MAX_SCRUBBED_CHARACTERS at most."""
     text = _PEM.sub(lambda found: f"({found[1].strip() or 'PEM'} left out)", text)
     lines = []
     named_at = -1
@@ -55,7 +55,7 @@ def scrubbed(text: str) -> str:
     is_first = False
     unclosed = _Unclosed()
     for whole in text.split("\n"):
-        line = whole if len(whole) <= MAX_LINE else f"{whole[:MAX_LINE]}..."
+        line = whole if len(whole) <= MAX_SCRUBBED_CHARACTERS else f"{whole[:MAX_SCRUBBED_CHARACTERS]}..."
         content = line.lstrip()
         if not content:
             lines.append("")
@@ -68,7 +68,7 @@ def scrubbed(text: str) -> str:
             if is_first or within or indent > named_at or (indent == named_at and content.startswith("-")):
                 is_first = False
                 unclosed.take(content)
-                lines.append(f"{line[: min(indent, MAX_LINE)]}{LEFT_OUT}")
+                lines.append(f"{line[: min(indent, MAX_SCRUBBED_CHARACTERS)]}{LEFT_OUT}")
                 continue
             named_at = -1
         shown, value = _line(line)

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 CONNECT_S = 3.0
 STATE_S = 10.0
 """Longest time for the answer about the sidecar's state; thousands of paths come in a second."""
-MAX_LINE_BYTES = 1 << 20
+MAX_ANSWER_LINE_BYTES = 1 << 20
 MAX_STATE_BYTES = 8 << 20
 """Longest whole answer: some 20,000 paths."""
 ACCOUNT = "plr"
@@ -133,8 +133,8 @@ class LocalClient:
                 del self._received[: position + 1]
                 return _parse(line), position + 1
             searched = len(self._received)
-            if searched > MAX_LINE_BYTES:
-                raise LocalError(f"{_STRANGER}: a line of more than {MAX_LINE_BYTES} bytes")
+            if searched > MAX_ANSWER_LINE_BYTES:
+                raise LocalError(f"{_STRANGER}: a line of more than {MAX_ANSWER_LINE_BYTES} bytes")
             left_s = end - time.monotonic()
             if left_s <= 0:
                 return None, 0

@@ -22,9 +22,9 @@ from plr.sidecar.core.wire.frame import MAX_DATAGRAM_BYTES
 
 VERSION = 1
 """Version in the part `node`. A client has to ignore parts and keys that it does not know."""
-MAX_REQUEST_BYTES = 1024
+MAX_REQUEST_LINE_BYTES = 1024
 """Longest line, including its end."""
-MAX_REQUESTS = 8
+MAX_REQUESTS_OF_CONNECTION = 8
 """Most requests of one connection being answered."""
 MAX_ID = 1 << 32
 _MAX_INTERFACE_CHARACTERS = 15
@@ -51,8 +51,8 @@ class PingRequest:
 
 def decode_request(line: bytes) -> StateRequest | PingRequest:
     """Parse one request line; raises DecodeError."""
-    if len(line) > MAX_REQUEST_BYTES:
-        raise DecodeError(f"a request has at most {MAX_REQUEST_BYTES} bytes")
+    if len(line) > MAX_REQUEST_LINE_BYTES:
+        raise DecodeError(f"a request has at most {MAX_REQUEST_LINE_BYTES} bytes")
     try:
         request = json.loads(line)
     except (ValueError, RecursionError):

@@ -26,8 +26,8 @@ from plr.sidecar.core.link.pinging import Pong
 from plr.sidecar.local.entrance import Entrance, SocketLock, for_group
 from plr.sidecar.local.peer import groups_of, user_of
 from plr.sidecar.local.protocol import (
-    MAX_REQUEST_BYTES,
-    MAX_REQUESTS,
+    MAX_REQUEST_LINE_BYTES,
+    MAX_REQUESTS_OF_CONNECTION,
     PingRequest,
     StateRequest,
     decode_request,
@@ -35,7 +35,7 @@ from plr.sidecar.local.protocol import (
     encode_error,
     encode_part,
 )
-from plr.sidecar.local.shares import Rate, Rates, Shares
+from plr.sidecar.local.shares import Rate, Rates, UserShares
 
 if TYPE_CHECKING:
     import socket
@@ -50,7 +50,7 @@ GROUP = "plr"
 """Group whose members may ask, besides root and the sidecar's own user."""
 MAX_OWN = 8
 """Most connections of root and the sidecar's own user."""
-MAX_MEMBERS = 16
+MAX_MEMBER_CONNECTIONS = 16
 """Most connections of all others together ..."""
 MAX_OF_A_USER = 4
 """... and of each of them."""
@@ -64,9 +64,9 @@ STATES = Rates(owner=Rate(4.0, 8.0), members=Rate(2.0, 8.0), member=Rate(1.0, 4.
 PING_REQUESTS = Rates(owner=Rate(50.0, 100.0), members=Rate(40.0, 80.0), member=Rate(20.0, 40.0))
 PINGS = Rates(owner=Rate(50.0, 100.0), members=Rate(10.0, 30.0), member=Rate(5.0, 15.0))
 """Pings over each interface, which sends few (`sidecar/core/link/pinging.py`): members leave half of them to root."""
-MAX_INTERFACES = 64
+MAX_PINGED_INTERFACES = 64
 """Interfaces whose requested pings are remembered."""
-MAX_PINGS_OUT = 256
+MAX_REQUESTED_PINGS = 256
 MAX_OUT_OF_MEMBERS, MAX_OUT_OF_A_USER = 192, 64
 PONG_WAIT_S = 10.0
 """Time within which a ping is answered, or not at all: a round trip of 10 s is the longest that has to work."""
@@ -80,7 +80,7 @@ ERROR_PAUSE_S = 0.1
 STOP_S = 1.0
 
 REFUSALS = ("full", "user_full", "not_allowed", "bad_request", "too_often", "too_slow", "pongs_full")
-"""The keys of `LocalServer.refused`."""
+"""The keys of `LocalSocketServer.refused`."""
 
 _TOO_MANY_PINGS = "too many pings of users other than root: wait a second"
 
@@ -95,7 +95,7 @@ class LocalSource(Protocol):
         """Return the paths to a peer, only those over `interface` if it is given."""
 
     def ping(self, path: PathId, number: int, size: int) -> None:
-        """Send a ping; `LocalServer.on_pong` gets the result."""
+        """Send a ping; `LocalSocketServer.on_pong` gets the result."""
 
 
 class LocalSocketError(Exception):
@@ -133,7 +133,7 @@ class _Client:
     """No more requests are taken from it."""
 
 
-class LocalServer:
+class LocalSocketServer:
     """Listens at `path` from `open` to `close`."""
 
     def __init__(self, path: Path, source: LocalSource) -> None:
@@ -153,9 +153,9 @@ class LocalServer:
         self._out: dict[int, tuple[_Client, int, PathId]] = {}
         """Outstanding pings by number: (client, request's id, path)."""
         now = time.monotonic()
-        self._states = Shares(STATES, now)
-        self._ping_requests = Shares(PING_REQUESTS, now)
-        self._pings: dict[str, Shares] = {}
+        self._states = UserShares(STATES, now)
+        self._ping_requests = UserShares(PING_REQUESTS, now)
+        self._pings: dict[str, UserShares] = {}
         """Shares of pings by interface."""
         self._stopping = False
         self._thread = threading.Thread(target=self._run, name="plr-local", daemon=True)
@@ -179,7 +179,7 @@ class LocalServer:
 
     def on_pong(self, pong: Pong) -> None:
         """Take the result of a ping; from any thread, which does not wait."""
-        if len(self._pongs) >= 2 * MAX_PINGS_OUT:
+        if len(self._pongs) >= 2 * MAX_REQUESTED_PINGS:
             self.refused["pongs_full"] += 1
             return
         self._pongs.append(pong)
@@ -283,7 +283,7 @@ class LocalServer:
             return "not_allowed", f"only root and members of the group {GROUP} may ask"
         if others.count(user) >= MAX_OF_A_USER:
             return "user_full", "too many clients of this user ask at once: try again"
-        if len(others) - others.count(None) >= MAX_MEMBERS:
+        if len(others) - others.count(None) >= MAX_MEMBER_CONNECTIONS:
             return "full", "too many clients ask at once: try again"
         return None
 
@@ -304,7 +304,7 @@ class LocalServer:
 
     def _read(self, client: _Client) -> None:
         try:
-            data = client.sock.recv(MAX_REQUEST_BYTES)
+            data = client.sock.recv(MAX_REQUEST_LINE_BYTES)
         except BlockingIOError:  # the event belonged to an earlier connection with the same number
             return
         if not data and _is_gone(client.sock):
@@ -321,8 +321,8 @@ class LocalServer:
             self._take(client, line)
         if client.closing or client.rests_until:
             return
-        if len(client.received) > MAX_REQUEST_BYTES:
-            self._refuse_and_close(client, f"a request is a line of at most {MAX_REQUEST_BYTES} bytes")
+        if len(client.received) > MAX_REQUEST_LINE_BYTES:
+            self._refuse_and_close(client, f"a request is a line of at most {MAX_REQUEST_LINE_BYTES} bytes")
         elif client.ended:
             client.closing = True
             if client.received:
@@ -338,7 +338,7 @@ class LocalServer:
             self._refuse_and_close(client, str(error))
             return
         now = time.monotonic()
-        if len(client.answers) + len(client.rounds) >= MAX_REQUESTS or request.id in client.rounds:
+        if len(client.answers) + len(client.rounds) >= MAX_REQUESTS_OF_CONNECTION or request.id in client.rounds:
             self._too_often(client, request.id)
         elif isinstance(request, StateRequest):
             if self._states.take(client.user, now):
@@ -394,19 +394,19 @@ class LocalServer:
 
     def _may_be_out(self, user: int | None, more: int) -> bool:
         users = [client.user for client, _, _ in self._out.values()]
-        if len(users) + more > MAX_PINGS_OUT:
+        if len(users) + more > MAX_REQUESTED_PINGS:
             return False
         return user is None or (
             users.count(user) + more <= MAX_OUT_OF_A_USER
             and len(users) - users.count(None) + more <= MAX_OUT_OF_MEMBERS
         )
 
-    def _shares_of(self, interface: str, now: float) -> Shares:
+    def _shares_of(self, interface: str, now: float) -> UserShares:
         shares = self._pings.get(interface)
         if shares is None:
-            if len(self._pings) >= MAX_INTERFACES:
+            if len(self._pings) >= MAX_PINGED_INTERFACES:
                 del self._pings[next(iter(self._pings))]
-            shares = self._pings[interface] = Shares(PINGS, now)
+            shares = self._pings[interface] = UserShares(PINGS, now)
         return shares
 
     def _deliver_pongs(self) -> None:

@@ -37,7 +37,7 @@ class Rates:
     """Rate of one of them."""
 
 
-class Shares:
+class UserShares:
     """Counts requests of one kind by user (None: the owner); times are monotonic seconds."""
 
     def __init__(self, rates: Rates, now: float) -> None:

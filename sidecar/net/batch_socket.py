@@ -43,7 +43,7 @@ _PERHAPS_SEGMENTATION = frozenset({errno.EIO, errno.EINVAL, errno.EMSGSIZE, errn
 """Errors with which a kernel refuses to segment. The datagram itself may be at fault: only sending it alone shows."""
 
 
-class Run(NamedTuple):
+class DatagramRun(NamedTuple):
     """Datagrams of one sender, contiguous in memory: `segment` bytes each, the last may be shorter."""
 
     data: memoryview
@@ -91,10 +91,10 @@ class BatchSocket:
             self._drop(error.errno, batch.datagrams)
         return None
 
-    def receive(self, at_most: int = RECEIVE_CALLS) -> list[Run]:
+    def receive(self, at_most: int = RECEIVE_CALLS) -> list[DatagramRun]:
         """Return what has arrived, by at most so many system calls; the views are valid until the next call."""
         arena, receive = self._arena, self._socket.recvmsg_into
-        runs: list[Run] = []
+        runs: list[DatagramRun] = []
         start = end = segment = 0
         sender: tuple[Any, ...] = ()
         for _ in range(at_most):
@@ -119,11 +119,11 @@ class BatchSocket:
             )
             if not extends:
                 if end > start:
-                    runs.append(Run(arena[start:end], segment, normalise(sender)))
+                    runs.append(DatagramRun(arena[start:end], segment, normalise(sender)))
                 start, segment, sender = end, joined, source
             end += size
         if end > start:
-            runs.append(Run(arena[start:end], segment, normalise(sender)))
+            runs.append(DatagramRun(arena[start:end], segment, normalise(sender)))
         return runs
 
     def _send_each(self, batch: Batch, destination: _SockAddr, refused: OSError | None = None) -> Batch | None:

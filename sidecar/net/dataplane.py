@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from plr.sidecar.core.base.values import ExecutionId, PathId, RejectReason, RequestId
     from plr.sidecar.core.crypto.session import OwnSession
     from plr.sidecar.core.message.decoding import Decoding
-    from plr.sidecar.core.path.history import Change
+    from plr.sidecar.core.path.history import LivenessChange
     from plr.sidecar.core.path.view import PathView
     from plr.sidecar.core.seam.application import CarriedService
     from plr.sidecar.core.seam.links import LinkEvent
@@ -158,10 +158,10 @@ class ThreadedDataPlane:
         with self._turn as (engine, now):
             engine.robot.requests.judge_answer(request_id, copy, problem, now)
 
-    def answered_here(self, request_id: RequestId) -> None:
+    def answered_locally(self, request_id: RequestId) -> None:
         """Robot: note that the application got its answer on the robot."""
         with self._turn as (engine, now):
-            engine.robot.requests.answered_here(request_id, now)
+            engine.robot.requests.answered_locally(request_id, now)
 
     def complete(self, execution: ExecutionId, payload: bytes, processing_s: float) -> None:
         """Cloud: send the local server's answer."""
@@ -252,15 +252,15 @@ class ThreadedDataPlane:
         """Return the links' paths to a peer, whatever their state; takes no lock."""
         return [path for link in list(self._links.values()) for path in link.link.paths_to(peer)]
 
-    def path_views(self, now: float) -> Iterator[tuple[PathView, Change | None]]:
+    def path_views(self, now: float) -> Iterator[tuple[PathView, LivenessChange | None]]:
         """Yield each path's state and its last change; takes no lock, and may be paused between two."""
         for link in list(self._links.values()):
             for view in link.link.views(now):
                 yield view, link.history.last(view.id)
 
-    def gone_paths(self, since: float, at_most: int) -> list[tuple[PathId, Change]]:
+    def gone_paths(self, since: float, at_most: int) -> list[tuple[PathId, LivenessChange]]:
         """Return the paths that ended after `since` because their peers are gone, the latest first; takes no lock."""
-        gone: list[tuple[PathId, Change]] = []
+        gone: list[tuple[PathId, LivenessChange]] = []
         for link in list(self._links.values()):
             known = link.link.path_ids()
             gone += [(path, last) for path, last in link.history.all().items() if path not in known]

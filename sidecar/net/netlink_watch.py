@@ -34,7 +34,7 @@ _ROUTE = struct.Struct("=BB")
 
 MESSAGE_BYTES = 32_768
 """Read buffer: the kernel's announcements are at most a page or two."""
-MAX_MESSAGES = 64
+MAX_NETLINK_MESSAGES = 64
 """Most messages read at a time: a flood must not keep its reader from everything else."""
 
 
@@ -91,7 +91,7 @@ class NetlinkWatch:
     def _read(self, sock: socket.socket) -> Changes:
         changed = False
         gone: dict[int, bool] = {}
-        for _ in range(MAX_MESSAGES):
+        for _ in range(MAX_NETLINK_MESSAGES):
             try:
                 data, (port, _groups) = sock.recvfrom(MESSAGE_BYTES)
             except BlockingIOError:

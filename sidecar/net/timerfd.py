@@ -6,12 +6,11 @@ epoll's own timeout counts whole milliseconds. Gain over it: docs/develop/adr/00
 from __future__ import annotations
 
 import ctypes
-import math
 import os
 import time
 import weakref
 
-NEVER = math.inf
+from plr.sidecar.core.base.timers import NEVER
 
 _NANOSECONDS = 1_000_000_000
 _EARLIEST_S = 1e-6

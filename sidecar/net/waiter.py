@@ -7,7 +7,8 @@ import select
 import weakref
 from typing import TYPE_CHECKING
 
-from plr.sidecar.net.timerfd import NEVER, Timer
+from plr.sidecar.core.base.timers import NEVER
+from plr.sidecar.net.timerfd import Timer
 
 if TYPE_CHECKING:
     from collections.abc import Callable

@@ -19,7 +19,7 @@ at the earliest."""
 LOOK_EVERY_S = 0.1
 
 
-class Changes(NamedTuple):
+class ThreadChanges(NamedTuple):
     """Threads that hung or came back since the last look."""
 
     hung: list[InterfaceThread]
@@ -37,7 +37,7 @@ class Watchdog:
         """Return whether it hung at the last look."""
         return thread in self._hung
 
-    def look(self, threads: Collection[InterfaceThread], now: float) -> Changes | None:
+    def look(self, threads: Collection[InterfaceThread], now: float) -> ThreadChanges | None:
         """Look at these threads, which are all there are; return what changed, if anything did."""
         slept, self._looked_at = now - self._looked_at, now
         if slept > HUNG_AFTER_S:
@@ -49,7 +49,7 @@ class Watchdog:
             for thread in threads
             if thread.in_turn_for(now) > HUNG_AFTER_S and (thread in before or thread.is_in_a_call())
         }
-        changes = Changes(
+        changes = ThreadChanges(
             [thread for thread in threads if thread in self._hung and thread not in before],
             [thread for thread in threads if thread in before and thread not in self._hung],
         )

@@ -17,7 +17,7 @@ from plr.sidecar.core.seam.application import ExecuteRequest
 from plr.sidecar.ros.cloud.cloud_side import CloudSide
 from plr.sidecar.ros.event_queue import EventQueue
 from plr.sidecar.ros.graph.graph import sidecar_node_name
-from plr.sidecar.ros.graph.looks import Looks
+from plr.sidecar.ros.graph.scans import Scans
 from plr.sidecar.ros.log_limit import LimitedLog
 from plr.sidecar.ros.robot.robot_side import RobotSide
 from plr.sidecar.ros.ros_loop import RosLoop
@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from plr.sidecar.core.rules.service_rule import ServiceRule
     from plr.sidecar.core.seam.application import ApplicationEvent
     from plr.sidecar.ports import Application, DataPlane
+    from plr.sidecar.ros.ros_loop import Waited
 
 DRAIN_S = 0.005
 """Time the ROS thread spends on the data plane's events before it takes the servers' answers again."""
@@ -43,11 +44,12 @@ log = logging.getLogger(__name__)
 class _Side(Protocol):
     """What RobotSide and CloudSide have in common."""
 
-    look_is_due: bool
+    scan_is_due: bool
 
     def settling(self) -> bool: ...
     def handle(self, event: ApplicationEvent, now: float) -> None: ...
-    def look(self) -> Iterator[None]: ...
+    def take(self, entity: Waited, now: float) -> None: ...
+    def scan(self) -> Iterator[None]: ...
     def next_due(self) -> float | None: ...
     def on_timer(self, now: float) -> None: ...
     def close(self) -> None: ...
@@ -127,18 +129,18 @@ class RosBridge:
         )
 
     def _run(self, loop: RosLoop, side: _Side, data_plane: DataPlane) -> None:
-        looks = Looks(side.look, side.settling, time.monotonic())
+        scans = Scans(side.scan, side.settling, time.monotonic())
         while not self._stopping:
             try:
                 now = time.monotonic()
-                if loop.graph_changed or side.look_is_due:
-                    loop.graph_changed = side.look_is_due = False
-                    looks.changed(now)
-                looks.turn(now)
-                look_at, due = looks.next_due(), side.next_due()
-                until = look_at if due is None else min(look_at, due)
+                if loop.graph_changed or side.scan_is_due:
+                    loop.graph_changed = side.scan_is_due = False
+                    scans.changed(now)
+                scans.turn(now)
+                scan_at, due = scans.next_due(), side.next_due()
+                until = scan_at if due is None else min(scan_at, due)
                 ready = loop.wait(0.0 if self._events else until - time.monotonic())
-            # Retry a wait or look that failed; requests at the servers and answers stay as they are.
+            # Retry a wait or scan that failed; requests at the servers and answers stay as they are.
             except Exception:
                 self._note_error("wait", time.monotonic())
                 time.sleep(_ERROR_PAUSE_S)
@@ -146,7 +148,7 @@ class RosBridge:
             now = time.monotonic()
             for entity in ready:  # before the events, which may destroy some of them
                 try:
-                    entity.take(now)
+                    side.take(entity, now)
                 except Exception:
                     self._note_error("take", now)
             self._drain(side, now)

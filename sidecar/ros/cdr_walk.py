@@ -10,7 +10,7 @@ are aligned to their size, counted from the end of the 4-byte encapsulation head
 32-bit length; that of a string includes its NUL.
 
 An honest large message is one long array, or thousands of elements that look alike. So runs of elements with the same
-lengths at the same places are skipped at once. The rest is walked step by step, in at most `MAX_STEPS` steps.
+lengths at the same places are skipped at once. The rest is walked step by step, in at most `MAX_WALK_STEPS` steps.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 ENCAPSULATION_BYTES = 4
 ALIGNMENT = 8
 """Largest alignment: the size of a fixed layout depends on its start position modulo this."""
-MAX_STEPS = 24_000
+MAX_WALK_STEPS = 24_000
 """Lengths checked one by one: some 20 ms, or 21,000 strings of different lengths."""
 COMPARISON_STEPS = 8
 """Cost of finding out that no more elements look alike, in steps."""
@@ -63,7 +63,7 @@ class Walk:
         """Bytes of the C message so far, its own structure included."""
         self.memory_left = memory_bytes
         self.allocations = 0
-        self.steps_left = MAX_STEPS
+        self.steps_left = MAX_WALK_STEPS
         self.lengths: list[int] | None = None
         """Positions of the lengths, while elements are compared."""
 
@@ -80,10 +80,10 @@ class Walk:
         return found, begin
 
     def step(self, steps: int) -> None:
-        """Count `steps` steps; raise CdrError beyond MAX_STEPS."""
+        """Count `steps` steps; raise CdrError beyond MAX_WALK_STEPS."""
         self.steps_left -= steps
         if self.steps_left < 0:
-            raise CdrError(f"more than {MAX_STEPS} strings and sequences of different lengths")
+            raise CdrError(f"more than {MAX_WALK_STEPS} strings and sequences of different lengths")
 
     def note_lengths(self) -> None:
         """Start to note the positions of lengths."""

@@ -43,9 +43,6 @@ class Waited(Protocol):
     def handle(self) -> Any:
         """rclpy's handle of a service or client."""
 
-    def take(self, now: float) -> None:
-        """Take what has arrived."""
-
 
 class RosLoop:
     """Context, node and wait set. All methods but `wake` belong to one thread."""

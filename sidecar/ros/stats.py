@@ -49,7 +49,7 @@ class BridgeStats:
     requests_paced: int = 0
     """Cloud: requests held back so that the server's queue does not overflow."""
     scans: int = 0
-    """Looks at the ROS graph."""
+    """Scans of the ROS graph."""
     left_alone: dict[ServiceName, tuple[str, ...]] = field(default_factory=dict)
     """Robot: offered services that other nodes already serve here, with those nodes. Replaced, never changed."""
     missing_types: dict[ServiceName, str] = field(default_factory=dict)

@@ -44,7 +44,7 @@ FORMAT_VERSION = 1
 LAST_GOOD_VERSION = 2
 """Since version 2 the tokens of peers are specific to this sidecar, and their addresses are signed."""
 
-MAX_FILE_BYTES = 64 << 20
+MAX_STATE_FILE_BYTES = 64 << 20
 """Well above the largest peer set and mapping that the control stream can carry."""
 
 _IDENTITY_MAGIC = b"plr-id\0\0"
@@ -60,7 +60,7 @@ _LENGTH = struct.Struct("!I")
 
 
 @dataclass(frozen=True, slots=True)
-class Identity:
+class SavedIdentity:
     """The sidecar's identity across restarts."""
 
     token: bytes = field(repr=False)
@@ -98,17 +98,17 @@ class LastGood:
                 return replace(self, mapping=message)
 
 
-def encode_identity(identity: Identity) -> bytes:
+def encode_identity(identity: SavedIdentity) -> bytes:
     """Return the file's content."""
     return _seal(_IDENTITY_MAGIC, _IDENTITY.pack(identity.token, identity.incarnation))
 
 
-def decode_identity(data: bytes) -> Identity:
+def decode_identity(data: bytes) -> SavedIdentity:
     """Read the file's content; raises DecodeError."""
     body = _open(_IDENTITY_MAGIC, data)
     if len(body) != _IDENTITY.size:
         raise DecodeError(f"the identity has {len(body)} bytes, not {_IDENTITY.size}")
-    return Identity(*_IDENTITY.unpack(body))
+    return SavedIdentity(*_IDENTITY.unpack(body))
 
 
 def encode_last_good(last: LastGood) -> bytes:

@@ -21,10 +21,10 @@ from plr.protos.model.members import TOKEN_BYTES
 from plr.protos.program.own_folder import OwnFolder
 from plr.protos.program.regular_file import open_regular
 from plr.sidecar.state.file import (
-    MAX_FILE_BYTES,
+    MAX_STATE_FILE_BYTES,
     ControlAddresses,
-    Identity,
     LastGood,
+    SavedIdentity,
     decode_addresses,
     decode_clock_floor,
     decode_identity,
@@ -153,11 +153,11 @@ class StateStore:
             os.close(self._lock)
             self._folder.close()
 
-    def _next_identity(self) -> Identity:
+    def _next_identity(self) -> SavedIdentity:
         known = self._read(IDENTITY_FILE, decode_identity)
         # Milliseconds since 1970 make the number grow even if the last one could not be read or written.
         incarnation = max(known.incarnation + 1 if known else 1, int(time.time() * 1000.0))
-        identity = Identity(known.token if known else secrets.token_bytes(TOKEN_BYTES), incarnation)
+        identity = SavedIdentity(known.token if known else secrets.token_bytes(TOKEN_BYTES), incarnation)
         data = encode_identity(identity)
         if not self._write(IDENTITY_FILE, data):
             self._dirty[IDENTITY_FILE] = data
@@ -187,9 +187,9 @@ class StateStore:
         path = self._folder.path / name
         try:
             with self._folder.open_to_read(name) as file:
-                data = file.read(MAX_FILE_BYTES + 1)
-            if len(data) > MAX_FILE_BYTES:
-                raise DecodeError(f"more than {MAX_FILE_BYTES} bytes")
+                data = file.read(MAX_STATE_FILE_BYTES + 1)
+            if len(data) > MAX_STATE_FILE_BYTES:
+                raise DecodeError(f"more than {MAX_STATE_FILE_BYTES} bytes")
             return decode(data)
         except FileNotFoundError:
             return None
@@ -230,7 +230,7 @@ def peek_last_good(folder: Path, owner: NodeName) -> LastGood:
     """
     try:
         with open_regular(folder / LAST_GOOD_FILE) as file:
-            data = file.read(MAX_FILE_BYTES + 1)
+            data = file.read(MAX_STATE_FILE_BYTES + 1)
         return decode_last_good(data, owner)
     except (OSError, DecodeError):
         return LastGood(owner)

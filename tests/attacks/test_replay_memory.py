@@ -12,7 +12,7 @@ import pytest
 
 from plr.protos.model.ids import InterfaceId, InterfaceName, NodeName, Role, SessionId, Version
 from plr.protos.model.members import PeerSet
-from plr.sidecar.core.link.memory import MAX_PATHS_OF_A_PEER
+from plr.sidecar.core.link.memory import MAX_REMEMBERED_PATHS_OF_PEER
 from plr.sidecar.core.path.key_exchange import DEFAULT_LIMITS, KeyLimits
 from plr.sidecar.core.path.keys import make_path_keys
 from plr.sidecar.core.wire import frame
@@ -112,7 +112,7 @@ def test_recorded_requests_of_a_robot_that_is_away_never_run_again(*, proven: bo
     cut(mesh, "evil.wlan0", off=True)
     Flood(mesh, evil, cloud, proven=proven).run()
     memory = of_cloud(cloud)._table._memory
-    assert len(memory) <= MAX_PATHS_OF_A_PEER + 1
+    assert len(memory) <= MAX_REMEMBERED_PATHS_OF_PEER + 1
     assert (len(memory) > 31) == proven, "what never proved itself is not remembered"
     show_all_but(mesh)
     mesh.run(1)

@@ -11,11 +11,11 @@ from plr.protos.model.ids import Role, ServiceName
 from plr.sidecar.core.base.values import PathState, Priority, RejectReason, RequestId
 from plr.sidecar.core.cloud.answers import MAX_ANSWER_BYTES, MAX_ANSWERS
 from plr.sidecar.core.cloud.answers import TIMER_SLACK as ANSWER_TIMER_SLACK
-from plr.sidecar.core.cloud.executions import MAX_CACHED_BYTES, MAX_REMEMBERED, MAX_RUNNING, TIMER_SLACK
+from plr.sidecar.core.cloud.executions import MAX_CACHED_BYTES, MAX_REMEMBERED_IDS, MAX_RUNNING, TIMER_SLACK
 from plr.sidecar.core.cloud.refused_copies import MAX_REFUSED_COPIES
 from plr.sidecar.core.message.reassembly import MAX_PEER_BYTES, MAX_PEER_MESSAGES, OVER_REMEMBERED
 from plr.sidecar.core.path.owed import MAX_PENDING_FINISHED, MAX_PENDING_FRAMES
-from plr.sidecar.core.transfer.room import MAX_MESSAGES
+from plr.sidecar.core.transfer.room import MAX_UNDELIVERED_MESSAGES
 from plr.sidecar.core.wire import frame
 from plr.sidecar.core.wire.frame import BASE_SYMBOL_BYTES, MAX_MESSAGE_BYTES, Header, Probe, ProbeReply
 from plr.sidecar.core.wire.messages import (
@@ -135,7 +135,7 @@ def assert_bounded(node: Node) -> None:
         assert len(reassembler) <= MAX_PEER_MESSAGES
         assert len(reassembler._over) <= OVER_REMEMBERED
     assert len(engine._inbound._reassemblers) <= len(engine.peers.names())
-    assert len(engine._outbox) <= MAX_MESSAGES
+    assert len(engine._outbox) <= MAX_UNDELIVERED_MESSAGES
     assert engine._outbox.held_bytes <= MAX_PEER_BYTES * len(engine.peers.names())
     assert len(engine.stats.executions) < 20
     assert len(engine.stats.dropped) < 40
@@ -156,7 +156,7 @@ def assert_cloud_bounded(cloud: CloudRole) -> None:
     assert len(answers._timers) <= 2 * len(answers) + ANSWER_TIMER_SLACK + 1
     executions = cloud.executions
     assert executions.running <= MAX_RUNNING
-    assert len(executions._finished) <= MAX_REMEMBERED + MAX_RUNNING
+    assert len(executions._finished) <= MAX_REMEMBERED_IDS + MAX_RUNNING
     assert len(executions._timers) <= 2 * executions.running + TIMER_SLACK + 1
     assert executions._cache.held_bytes <= MAX_CACHED_BYTES
     assert len(executions._refused) <= MAX_REFUSED_COPIES

@@ -15,7 +15,6 @@ from typing import TYPE_CHECKING, Any
 import pytest
 import yaml
 
-from plr.controlplane.__main__ import EXIT_USAGE
 from plr.controlplane.cli.__main__ import main as plr
 from plr.controlplane.config.controlplane import load_config as load_controlplane_config
 from plr.controlplane.core.control.control import ControlCore
@@ -23,6 +22,7 @@ from plr.controlplane.observe.fleet_metrics import Fleet
 from plr.controlplane.observe.metrics import Metrics
 from plr.protos.base.host_port import split_host_port
 from plr.protos.model.ids import NodeName, Role
+from plr.protos.program.exit_codes import EXIT_USAGE
 from plr.protos.trust.identity import Identity, IdentityRole, RevocationList
 from plr.sidecar.config.sidecar import SidecarConfig, load_config
 from plr.sidecar.control.revocations import RevocationState

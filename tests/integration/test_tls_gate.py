@@ -150,7 +150,7 @@ def test_of_many_connections_of_one_name_the_oldest_ends(tmp_path: Path, monkeyp
 
 
 def test_beyond_all_connections_a_further_one_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(tls_gate, "MAX_CONNECTIONS", 1)
+    monkeypatch.setattr(tls_gate, "MAX_TLS_CONNECTIONS", 1)
 
     async def run() -> None:
         async with opened(tmp_path) as gate:
@@ -292,7 +292,7 @@ def test_who_leaves_while_he_waits_costs_no_handshake(tmp_path: Path, monkeypatc
 def test_of_more_than_may_wait_the_oldest_goes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(tls_gate, "MAX_ON_THE_WAY", 1)
     monkeypatch.setattr(tls_gate, "ON_THE_WAY_S", PATIENCE_S)
-    monkeypatch.setattr(tls_gate, "MAX_WAITING", 3)
+    monkeypatch.setattr(tls_gate, "MAX_WAITING_CONNECTIONS", 3)
 
     async def run() -> None:
         async with opened(tmp_path) as gate, busy(gate):

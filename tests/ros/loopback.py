@@ -74,7 +74,7 @@ class Loopback:
         self.offers: tuple[ServiceOffer, ...] = ()
         self.carried: frozenset[ServiceName] = frozenset()
         self.refusals: list[tuple[RejectReason, str]] = []
-        self.answered_here: list[RequestId] = []
+        self.answered_locally: list[RequestId] = []
         self.asker = ROBOT
         """Whose requests the cloud is told these are."""
         self.counts: Counter[str] = Counter()
@@ -217,8 +217,8 @@ class RobotPlane:
     def judge_answer(self, request_id: RequestId, copy: int, problem: str | None) -> None:
         self._link.judged(request_id, problem)
 
-    def answered_here(self, request_id: RequestId) -> None:
-        self._link.answered_here.append(request_id)
+    def answered_locally(self, request_id: RequestId) -> None:
+        self._link.answered_locally.append(request_id)
 
     def complete(self, execution: ExecutionId, payload: bytes, processing_s: float) -> None:
         raise AssertionError("a robot completes nothing")
@@ -246,7 +246,7 @@ class CloudPlane:
     def judge_answer(self, request_id: RequestId, copy: int, problem: str | None) -> None:
         raise AssertionError("a server asks nothing")
 
-    def answered_here(self, request_id: RequestId) -> None:
+    def answered_locally(self, request_id: RequestId) -> None:
         raise AssertionError("a server asks nothing")
 
     def complete(self, execution: ExecutionId, payload: bytes, processing_s: float) -> None:

@@ -125,7 +125,7 @@ def test_a_service_comes_goes_and_comes_back(mesh: Mesh) -> None:
     assert mesh.robot.stats.answers_sent[PLAN] == 15
 
 
-def test_a_server_restarted_between_two_looks(mesh: Mesh, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_server_restarted_between_two_scans(mesh: Mesh, monkeypatch: pytest.MonkeyPatch) -> None:
     """The name never leaves the graph: only the server's endpoint tells that the old requests are lost."""
     monkeypatch.setattr(
         "plr.sidecar.ros.cloud.server_processes.ServerProcesses.watch", lambda _processes, _endpoint: None
@@ -136,8 +136,8 @@ def test_a_server_restarted_between_two_looks(mesh: Mesh, monkeypatch: pytest.Mo
     mesh.call("/plan", "--count", "4", "--tolerance", "-1", "--timeout-s", "1")
     wait_until(lambda: mesh.cloud.stats.pending == 4, "4 requests at the server")
     with monkeypatch.context() as blind:
-        blind.setattr("plr.sidecar.ros.graph.looks.Looks.turn", lambda _looks, _now: None)
-        blind.setattr("plr.sidecar.ros.graph.looks.Looks.next_due", lambda _looks: time.monotonic() + 0.1)
+        blind.setattr("plr.sidecar.ros.graph.scans.Scans.turn", lambda _scans, _now: None)
+        blind.setattr("plr.sidecar.ros.graph.scans.Scans.next_due", lambda _scans: time.monotonic() + 0.1)
         old.stop(signal.SIGTERM)
         mesh.serve("--plan", "/plan")
         node = mesh.cloud._loop.node  # type: ignore[union-attr]  # a started bridge has one

@@ -28,8 +28,8 @@ PLAN_TYPE = "nav_msgs/srv/GetPlan"
 
 @pytest.fixture
 def often(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Look at the graph often also while it does not change."""
-    monkeypatch.setattr("plr.sidecar.ros.graph.looks.IDLE_PERIOD_S", 0.1)
+    """Scan the graph often also while it does not change."""
+    monkeypatch.setattr("plr.sidecar.ros.graph.scans.IDLE_PERIOD_S", 0.1)
 
 
 def scanned(node: Any) -> dict[ServiceName, graph.Served]:
@@ -146,7 +146,7 @@ def test_two_cloud_sidecars_and_a_robot_in_one_domain(mesh: Mesh) -> None:
         mesh.serve("--plan", "/plan")
         wait_until(lambda: second_link.carried == {"/plan"} and mesh.link.offers, "the real service")
         scans = second_cloud.stats.scans
-        wait_until(lambda: second_cloud.stats.scans >= scans + 3, "three looks at the graph")
+        wait_until(lambda: second_cloud.stats.scans >= scans + 3, "three scans of the graph")
         assert {offer.name for offer in second_link.offers} == {offer.name for offer in mesh.link.offers} == {"/plan"}
         mesh.wait_carried("/elsewhere")
         assert mesh.robot.stats.left_alone == {"/plan": ("/test_server",)}
@@ -166,10 +166,10 @@ def test_two_robot_sidecars_in_one_domain_offer_a_name_once(mesh: Mesh) -> None:
     try:
         for bridge in (mesh.robot, other):
             bridge.handle(OfferService(PLAN, PLAN_TYPE))
-        wait_until(lambda: mesh.robot.stats.scans > 8 and other.stats.scans > 8, "looks at the graph")
+        wait_until(lambda: mesh.robot.stats.scans > 8 and other.stats.scans > 8, "scans of the graph")
         wait_until(lambda: len(mesh.link.carried) + len(other_link.carried) == 1, "exactly one proxy")
         scans = mesh.robot.stats.scans
-        wait_until(lambda: mesh.robot.stats.scans > scans + 4, "more looks")
+        wait_until(lambda: mesh.robot.stats.scans > scans + 4, "more scans")
         assert len(mesh.link.carried) + len(other_link.carried) == 1
     finally:
         assert other.stop()
@@ -190,7 +190,7 @@ def test_a_type_that_is_not_installed_on_the_robot(mesh: Mesh, caplog: pytest.Lo
         mesh.robot.handle(OfferService(ServiceName(name), kind))
     mesh.robot.handle(OfferService(ServiceName("/a"), "nowhere_msgs/srv/Thing"))
     mesh.wait_carried("/good")
-    wait_until(lambda: mesh.robot.stats.scans > 8, "more looks")
+    wait_until(lambda: mesh.robot.stats.scans > 8, "more scans")
     assert set(mesh.robot.stats.missing_types) == {"/a", "/b", "/c", "/d"}
     assert mesh.robot.stats.errors == {"type_not_installed": 2, "service_refused": 2}
     errors = [record.getMessage() for record in caplog.records if record.levelno >= logging.ERROR]

@@ -35,7 +35,7 @@ def test_more_requests_than_a_robot_may_have_pending(mesh: Mesh, monkeypatch: py
 
 
 def test_more_requests_than_a_server_may_have(mesh: Mesh, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("plr.sidecar.ros.cloud.cloud_side.MAX_EXECUTIONS", 20)
+    monkeypatch.setattr("plr.sidecar.ros.cloud.cloud_side.MAX_PENDING_CALLS", 20)
     mesh.start()
     mesh.serve("--plan", "/plan")
     mesh.wait_carried("/plan")
@@ -47,7 +47,7 @@ def test_more_requests_than_a_server_may_have(mesh: Mesh, monkeypatch: pytest.Mo
 
 def test_a_robot_that_fills_its_share_leaves_the_others_theirs(mesh: Mesh, monkeypatch: pytest.MonkeyPatch) -> None:
     """Its requests lie at a slow server; the other robot asks another one, which is idle."""
-    monkeypatch.setattr("plr.sidecar.ros.cloud.cloud_side.MAX_EXECUTIONS", 20)
+    monkeypatch.setattr("plr.sidecar.ros.cloud.cloud_side.MAX_PENDING_CALLS", 20)
     mesh.start()
     mesh.serve("--plan", "/plan")
     mesh.serve("--plan", "/slow", "--busy-s", "0.5")

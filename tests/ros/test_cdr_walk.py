@@ -160,7 +160,7 @@ def poses(count: int, frame: str = "map") -> bytes:
 def test_elements_that_look_alike_are_skipped_together(frame: str) -> None:
     walk = cdr_walk.Walk(memoryview(poses(100_000, frame))[4:], "<", 1 << 40)
     assert known_layout(Path).walk(walk, 0) <= walk.end
-    assert walk.steps_left > cdr_walk.MAX_STEPS - 100
+    assert walk.steps_left > cdr_walk.MAX_WALK_STEPS - 100
 
 
 def test_those_that_differ_are_walked_up_to_a_limit() -> None:
@@ -177,7 +177,7 @@ def test_paths_within_others_are_skipped_as_well() -> None:
     one += bytes(-len(one) % 8)
     walk = cdr_walk.Walk(memoryview(one * 40), "<", 1 << 40)
     assert cdr_walk.array(known_layout(Path), 40).walk(walk, 0) <= walk.end
-    assert walk.steps_left > cdr_walk.MAX_STEPS - 40 * 100
+    assert walk.steps_left > cdr_walk.MAX_WALK_STEPS - 40 * 100
 
 
 def test_no_bytes_of_16_mib_take_much_memory_or_time() -> None:
@@ -217,9 +217,9 @@ def test_runs_that_end_just_after_they_were_found_take_no_longer_than_lengths(st
     with contextlib.suppress(CdrError):
         layout.walk(walk, 0)
     took_s = time.thread_time() - began
-    walk.steps_left = cdr_walk.MAX_STEPS
-    plain = b"".join((long if number % 3 else short) for number in range(cdr_walk.MAX_STEPS // 2))
-    walk = cdr_walk.Walk(memoryview(struct.pack("<I", cdr_walk.MAX_STEPS // 2) + plain), "<", 1 << 40)
+    walk.steps_left = cdr_walk.MAX_WALK_STEPS
+    plain = b"".join((long if number % 3 else short) for number in range(cdr_walk.MAX_WALK_STEPS // 2))
+    walk = cdr_walk.Walk(memoryview(struct.pack("<I", cdr_walk.MAX_WALK_STEPS // 2) + plain), "<", 1 << 40)
     began = time.thread_time()
     with contextlib.suppress(CdrError):
         cdr_walk.structure([cdr_walk.Elements(cdr_walk.String())]).walk(walk, 0)

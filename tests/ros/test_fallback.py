@@ -50,7 +50,7 @@ def test_without_any_network_the_fallback_answers_in_time_also_after_a_crash(mes
     result = mesh.result(mesh.call(PLAN, "--count", "5", "--first", "10"))
     assert (result["answered"], result["wrong"]) == (5, 0)
     assert counted(mesh)["won"] - before.get("won", 0) == 5
-    assert len(mesh.link.answered_here) == 8
+    assert len(mesh.link.answered_locally) == 8
     assert mesh.robot.stats.unanswered == {}
 
 

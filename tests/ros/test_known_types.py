@@ -10,7 +10,7 @@ from plr.protos.model.ids import NodeName, Role, ServiceName, SessionId, Version
 from plr.protos.model.members import Peer, PeerSet, ServiceOffer
 from plr.sidecar.__main__ import main
 from plr.sidecar.core.rules.service_rule import ServiceRule
-from plr.sidecar.ros.graph.known_types import MAX_LINES, missing_types
+from plr.sidecar.ros.graph.known_types import MAX_MISSING_TYPE_LINES, missing_types
 from plr.sidecar.state.file import LastGood, encode_last_good
 from plr.sidecar.state.store import LAST_GOOD_FILE
 
@@ -40,8 +40,10 @@ def test_only_what_is_carried_and_lacks_its_type_is_named() -> None:
 
 
 def test_a_glob_does_not_fill_the_screen() -> None:
-    lines = missing_types([cloud(*((f"/a/{number}", ABSENT) for number in range(MAX_LINES + 3)))], [rule("/a/*")])
-    assert len(lines) == MAX_LINES + 1
+    lines = missing_types(
+        [cloud(*((f"/a/{number}", ABSENT) for number in range(MAX_MISSING_TYPE_LINES + 3)))], [rule("/a/*")]
+    )
+    assert len(lines) == MAX_MISSING_TYPE_LINES + 1
     assert lines[-1] == "and 3 more"
 
 

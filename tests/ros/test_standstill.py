@@ -109,9 +109,9 @@ def test_a_sidecar_that_stood_still_is_no_application(mesh: Mesh, caplog: pytest
 
     come_back(mesh.cloud, start, "/elsewhere", "_plr_sidecar_other_robot")
     wait_until(lambda: "/_plr_sidecar_other_robot" in caplog.text, "the sidecar's name")
-    # The name is there in time for the next look.
+    # The name is there in time for the next scan.
     scans = mesh.cloud.stats.scans
-    wait_until(lambda: mesh.cloud.stats.scans > scans, "another look")
+    wait_until(lambda: mesh.cloud.stats.scans > scans, "another scan")
     wait_known(mesh.cloud, "/elsewhere", UNKNOWN)
     assert not [record for record in caplog.records if "is offered to robots" in record.msg]
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 from plr.controlplane.core.control.control import ControlCore
 from plr.controlplane.core.control.events import OffersRefusedNotice, Settings
-from plr.controlplane.core.publish.messages import Send
+from plr.controlplane.core.publish.messages import SendMessage
 from plr.controlplane.core.registry.registry import Refusal
 from plr.controlplane.solver.matcher import solve
 from plr.protos.convert import control_message_to_proto, parse_control_message
@@ -88,7 +88,7 @@ class JoinedPlanes:
             plan = solve(picture.problem, time_limit_s=60.0, hint=self.core.plan)
             self.core.solved(self.core.settle(picture, plan, now), now)
         while (event := self.core.next_event()) is not None:
-            if isinstance(event, Send) and event.stream in self.streams:
+            if isinstance(event, SendMessage) and event.stream in self.streams:
                 self._deliver(event.stream, event.message)
             elif isinstance(event, OffersRefusedNotice):
                 self.refused_offers.append(event)

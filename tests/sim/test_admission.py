@@ -53,7 +53,7 @@ class World:
         self.up = True
         self._attempts: dict[int, Attempt] = {}
         self._gate: Admission[Attempt] = Admission(
-            most_waiting=tls_gate.MAX_WAITING,
+            most_waiting=tls_gate.MAX_WAITING_CONNECTIONS,
             most_on_the_way=tls_gate.MAX_ON_THE_WAY,
             stranger_s=tls_gate.ON_THE_WAY_S,
             member_s=tls_gate.HANDSHAKE_TIMEOUT_S,

@@ -102,7 +102,7 @@ def test_small_answers_do_not_wait_for_large_ones_nor_keep_them_out() -> None:
 
 
 def test_more_small_answers_than_messages_wait(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(room_module, "MAX_MESSAGES", 200)
+    monkeypatch.setattr(room_module, "MAX_UNDELIVERED_MESSAGES", 200)
     mesh, robot, cloud = world(1000)
     cloud.late_s = lambda: 0.02
     for _ in range(10):

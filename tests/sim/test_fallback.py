@@ -82,7 +82,7 @@ class Robot:
     def _answered(self, request_id: RequestId) -> None:
         if self.fallbacks.answered(request_id, self.mesh.now):
             self._answer(request_id)
-            self.node.engine.robot.requests.answered_here(request_id, self.mesh.now)
+            self.node.engine.robot.requests.answered_locally(request_id, self.mesh.now)
             self.mesh.pump(self.node)
         self._act()
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from plr.sidecar.core.message.reassembly import MAX_AGE_S
+from plr.sidecar.core.message.reassembly import MAX_SILENCE_S
 from plr.sidecar.core.path.pmtu import HEADERS_V4
 from plr.sidecar.core.wire.frame import BASE_BYTES
 from tests.sim.test_mesh import mapped, two_by_two
@@ -31,7 +31,7 @@ def test_a_message_that_the_receiver_forgot_in_an_outage_is_sent_again() -> None
     assert unfinished(cloud) == 1
     for wire in wires:
         wire.cut = True
-    mesh.run(MAX_AGE_S + 5.0)
+    mesh.run(MAX_SILENCE_S + 5.0)
     assert cloud.engine.stats.dropped["reassembly_expired"] == 1
     for wire in wires:
         wire.cut = False

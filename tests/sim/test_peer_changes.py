@@ -15,7 +15,7 @@ import pytest
 from plr.controlplane.core.control.control import ControlCore
 from plr.controlplane.core.control.events import Settings
 from plr.controlplane.core.policy.policy import CallRule, OfferRule, Policy
-from plr.controlplane.core.publish.messages import Close, Send
+from plr.controlplane.core.publish.messages import EndStream, SendMessage
 from plr.controlplane.core.publish.publisher import RESEND_S
 from plr.controlplane.core.registry.registry import Refusal, StreamId
 from plr.controlplane.serve import stream_encoder
@@ -144,11 +144,11 @@ class Fleet:
             self._carry_out(event)
 
     def _carry_out(self, event: Event) -> None:
-        if isinstance(event, Close):
+        if isinstance(event, EndStream):
             for member in self.members.values():
                 if member.stream == event.stream:
                     self.lose_stream(member)
-        if not isinstance(event, Send):
+        if not isinstance(event, SendMessage):
             return
         for member in self.members.values():
             if member.stream == event.stream and isinstance(event.message, Welcome | PeerSet):
@@ -314,7 +314,7 @@ def test_a_sidecar_of_before_gets_whole_sets_in_one_message(monkeypatch: pytest.
     core.handle_timer(2.0)
     sent = []
     while (event := core.next_event()) is not None:
-        if isinstance(event, Send) and event.stream == streams["cloud"] and isinstance(event.message, PeerSet):
+        if isinstance(event, SendMessage) and event.stream == streams["cloud"] and isinstance(event.message, PeerSet):
             sent.append(event.message)
     assert sent
     assert all(not message.base for message in sent)

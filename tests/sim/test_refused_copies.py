@@ -7,7 +7,7 @@ from functools import partial
 import pytest
 
 from plr.sidecar.core.base.values import RejectReason
-from plr.sidecar.core.robot.dispatch.dispatcher import MAX_ASKED, MAX_COPIES
+from plr.sidecar.core.robot.dispatch.dispatcher import MAX_COPIES_OF_REQUEST, MAX_COPIES_WHILE_REFUSED
 from plr.sidecar.core.seam.application import ApplicationEvent, ExecuteRequest, RequestFailed
 from tests.support.mesh import Mesh, rule
 
@@ -71,7 +71,7 @@ def test_a_server_that_takes_long_to_start_is_asked_until_it_is_there(away_s: fl
     assert len(robot.responses()) == 1
     assert len(cloud.executed) == 1
     asked = cloud.engine.stats.dropped["request_for_unknown_service"]
-    assert asked <= (MAX_COPIES if away_s < 7.0 else MAX_ASKED)
+    assert asked <= (MAX_COPIES_OF_REQUEST if away_s < 7.0 else MAX_COPIES_WHILE_REFUSED)
 
 
 def _cut(mesh: Mesh, *, cut: bool) -> None:

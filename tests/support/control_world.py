@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 from plr.controlplane.core.control.control import ControlCore
 from plr.controlplane.core.control.events import DepartureNotice, NackNotice, Settings
-from plr.controlplane.core.publish.messages import Close, CloseReason, Send
+from plr.controlplane.core.publish.messages import CloseReason, EndStream, SendMessage
 from plr.controlplane.core.registry.registry import Refusal, StreamId
 from plr.controlplane.solver.matcher import solve
 from plr.protos.model.ids import NodeName, Role, Version
@@ -174,11 +174,11 @@ class World:
         """Carry out what the core asks for."""
         while (event := self.core.next_event()) is not None:
             match event:
-                case Send(stream=stream, message=message):
+                case SendMessage(stream=stream, message=message):
                     sidecar = self._owner(stream)
                     if sidecar is not None:
                         self._deliver(sidecar, message)
-                case Close(stream=stream, reason=reason):
+                case EndStream(stream=stream, reason=reason):
                     self.closings.append((stream, reason))
                     sidecar = self._owner(stream)
                     if sidecar is not None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from plr.controlplane.observe.fleet_metrics import MAX_GONE, Fleet
+from plr.controlplane.observe.fleet_metrics import MAX_GONE_WITH_SERIES, Fleet
 from plr.protos.model.ids import NodeName
 
 if TYPE_CHECKING:
@@ -21,7 +21,7 @@ def fleet_of(world: World) -> Fleet:
     views = (world.core.view(sidecar.name, world.now) for sidecar in world.core.registry)
     return Fleet(
         members=[view for view in views if view is not None],
-        gone=world.core.departed.told(world.now, MAX_GONE),
+        gone=world.core.departed.told(world.now, MAX_GONE_WITH_SERIES),
         certificates_end={NodeName("robot"): 1.8e9},
         now=world.now,
         now_wall=1.7e9,

@@ -13,14 +13,14 @@ import pytest
 
 from plr.controlplane.ca import key_file, passphrase
 from plr.controlplane.ca.authority import DEFAULT_DAYS
-from plr.controlplane.ca.request import MAX_REQUEST_BYTES
+from plr.controlplane.ca.request import MAX_CERTIFICATE_REQUEST_BYTES
 from plr.controlplane.core.control.control import ControlCore
 from plr.controlplane.observe.fleet_metrics import Fleet
 from plr.controlplane.observe.metrics import Metrics
 from plr.protos.base.histogram import Histogram
 from plr.protos.convert.fields import MAX_CRL_BYTES
 from plr.protos.model.ids import InterfaceName, NodeName, ServiceName
-from plr.protos.program.tls_files import MAX_FILE_BYTES
+from plr.protos.program.tls_files import MAX_TLS_FILE_BYTES
 from plr.protos.trust.identity import MAX_CA_CERTIFICATES, Identity, IdentityRole, RevocationList
 from plr.sidecar.control.client import JUDGE_AGAIN_S
 from plr.sidecar.control.revocations import RevocationState
@@ -197,12 +197,12 @@ def test_a_line_that_nobody_writes_is_noticed() -> None:
 def test_the_page_of_certificates_has_the_numbers_of_the_code() -> None:
     page = " ".join(read("certificates.md").split())
     for said in (
-        f"a passphrase of {passphrase.MIN_BYTES} to {passphrase.MAX_BYTES} bytes",
+        f"a passphrase of {passphrase.MIN_PASSPHRASE_BYTES} to {passphrase.MAX_PASSPHRASE_BYTES} bytes",
         f"N = 2^{key_file.SCRYPT_N.bit_length() - 1}, r = {key_file.SCRYPT_R}, p = {key_file.SCRYPT_P}",
         f"a certificate for {DEFAULT_DAYS:.0f} days",
         f"the CAs to believe, {MAX_CA_CERTIFICATES} at most",
-        f"a file of more than {MAX_FILE_BYTES >> 20} MiB",
-        f"one of more than {MAX_REQUEST_BYTES >> 10} KiB",
+        f"a file of more than {MAX_TLS_FILE_BYTES >> 20} MiB",
+        f"one of more than {MAX_CERTIFICATE_REQUEST_BYTES >> 10} KiB",
         f"Lists of more than {MAX_CRL_BYTES >> 20} MiB in all",
         f"its number, {encode_message(RevocationsHeld({1: 1})).size} bytes for one CA",
         f"one question in {ASK_NEXT_AFTER_S:.0f} s at most",

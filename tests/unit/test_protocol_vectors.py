@@ -458,7 +458,7 @@ def test_the_numbers_on_the_page_are_those_of_the_code() -> None:
         f"go {path_table.UNPROVEN_BYTES} bytes in all and {path_table.UNPROVEN_BYTES_PER_S:.0f} bytes a second",
         f"up to {reassembly.MAX_PEER_BYTES >> 20} MiB of one peer's half messages",
         f"up to {reassembly.MAX_PEER_MESSAGES} of them",
-        f"no symbol for {reassembly.MAX_AGE_S:.0f} s",
+        f"no symbol for {reassembly.MAX_SILENCE_S:.0f} s",
         f"under a new number, up to {outbox.MAX_GENERATIONS} times",
         f"last byte is divisible by {OBSERVED_ONE_IN}",
     ):

@@ -34,7 +34,7 @@ from plr.controlplane.core.explain.fleet_view import MemberView, view_of
 from plr.controlplane.core.explain.returning import Returning
 from plr.controlplane.core.explain.status import is_met, is_offered, statuses
 from plr.controlplane.core.formulation.block import Picture
-from plr.controlplane.core.formulation.problem_builder import MAX_INTERFACES, Drawing
+from plr.controlplane.core.formulation.problem_builder import MAX_CONSIDERED_INTERFACES, Drawing
 from plr.controlplane.core.overload.pacing import Pacing
 from plr.controlplane.core.overload.urgency import Urgency
 from plr.controlplane.core.policy.cut_off import cut_off
@@ -45,11 +45,11 @@ from plr.controlplane.core.problem.plan import Plan
 from plr.controlplane.core.problem.problem import BlockKey, Problem
 from plr.controlplane.core.publish.history import MappingHistory
 from plr.controlplane.core.publish.mappings import changed_robots
-from plr.controlplane.core.publish.messages import Close, CloseReason, Send
+from plr.controlplane.core.publish.messages import CloseReason, EndStream, SendMessage
 from plr.controlplane.core.publish.publisher import Publisher
-from plr.controlplane.core.registry.registry import Admission, Refusal, Registry, StreamId
+from plr.controlplane.core.registry.registry import AcceptedRegistration, Refusal, Registry, StreamId
 from plr.controlplane.core.registry.restlessness import Restlessness
-from plr.controlplane.core.settle.explored_pair import Exploration
+from plr.controlplane.core.settle.explored_pair import ExploredPairs
 from plr.controlplane.core.settle.stability import Stability
 from plr.protos.base.errors import DecodeError
 from plr.protos.model.fleet_events import Why
@@ -130,7 +130,7 @@ class ControlCore:
         self.history = MappingHistory()
         self.departed = Departed()
         self._returning = Returning()
-        self._exploration = Exploration()
+        self._exploration = ExploredPairs()
         warm_until = now + settings.warm_up_s if settings.warm_up_s else None
         self._publisher = Publisher(self.registry, version_epoch=version_epoch, warm_until=warm_until)
         self._streams: dict[StreamId, NodeName] = {}
@@ -145,7 +145,7 @@ class ControlCore:
         self.reached = Reached()
         self.unanswered = Unanswered()
         self._publish_at: float | None = None
-        self._publications: deque[Iterator[Send | None]] = deque()
+        self._publications: deque[Iterator[SendMessage | None]] = deque()
         """Publications begun, and told to some; the first one continues first."""
         self._publishing_since = now
         self._events: deque[Event] = deque()
@@ -157,7 +157,7 @@ class ControlCore:
         stream = StreamId(self._last_stream + 1)
         before = self.registry.get(registration.name)
         result = self.registry.register(registration, stream, now)
-        if not isinstance(result, Admission):
+        if not isinstance(result, AcceptedRegistration):
             return result
         self._last_stream = stream
         name = registration.name
@@ -246,7 +246,7 @@ class ControlCore:
             changed = self.registry.set_candidates(name, told)
             if changed:
                 interfaces = len({candidate.interface for candidate in told.candidates})
-                self.counters.interfaces_left_out += max(0, interfaces - MAX_INTERFACES)
+                self.counters.interfaces_left_out += max(0, interfaces - MAX_CONSIDERED_INTERFACES)
         else:
             known = self.registry.get(name)
             if told.unmet and known is not None and told.unmet != known.unmet:
@@ -335,7 +335,7 @@ class ControlCore:
         welcome = Welcome(
             self.registry.lease_s, interval_s, self._settings.stun_servers, self._crl, self.pacing.reconnect_max_s
         )
-        self._events.append(Send(stream, welcome))
+        self._events.append(SendMessage(stream, welcome))
 
     def follow_load(self, now: float, busy: float | None = None) -> None:
         """Let sidecars report as often as their number and `busy` allow: the share of one core used recently.
@@ -388,7 +388,7 @@ class ControlCore:
     def _close(self, stream: StreamId | None, reason: CloseReason, now: float) -> None:
         """End a stream, if there is one; it has ended at once, not when the driver has carried that out."""
         if stream is not None:
-            self._events.append(Close(stream, reason))
+            self._events.append(EndStream(stream, reason))
             self.disconnected(stream, now)
 
     def disconnected(self, stream: StreamId, now: float) -> None:
@@ -623,7 +623,7 @@ class ControlCore:
             self._debounce.note(Change.MEMBERS, now)
         self._begin_publishing(self._publisher.publish(self.permits, self.plan, self._picture, now), now)
 
-    def _begin_publishing(self, publication: Iterator[Send | None], now: float) -> None:
+    def _begin_publishing(self, publication: Iterator[SendMessage | None], now: float) -> None:
         self._publications.append(publication)
         if len(self._publications) == 1:
             self._publishing_since = now
@@ -641,7 +641,7 @@ class ControlCore:
                 self._sent(send, now)
         self._publications.popleft()
 
-    def _sent(self, send: Send, now: float) -> None:
+    def _sent(self, send: SendMessage, now: float) -> None:
         if send.stream in self._streams:
             if isinstance(send.message, MappingSet):
                 self.history.note(self._streams[send.stream], send.message, now)

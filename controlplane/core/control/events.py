@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 from plr.controlplane.core.problem.problem import Objective
-from plr.controlplane.core.publish.messages import Close, Send
+from plr.controlplane.core.publish.messages import EndStream, SendMessage
 
 if TYPE_CHECKING:
     from plr.controlplane.core.explain.departed import Departure
@@ -110,6 +110,13 @@ class OffersRefusedNotice:
 
 
 Event = (
-    Send | Close | NackNotice | DepartureNotice | StreamLostNotice | CutOffNotice | UnmetNotice | OffersRefusedNotice
+    SendMessage
+    | EndStream
+    | NackNotice
+    | DepartureNotice
+    | StreamLostNotice
+    | CutOffNotice
+    | UnmetNotice
+    | OffersRefusedNotice
 )
 """What the driver has to do, in this order."""

@@ -15,8 +15,8 @@ from plr.controlplane.core.estimate.composed import Asked, from_parts, parts_of,
 from plr.controlplane.core.estimate.fading import FadedCount, FadedShares, forget_after_s, forget_before
 from plr.controlplane.core.estimate.interface_trouble import InterfaceTrouble
 from plr.controlplane.core.estimate.late_fate import LateFate
-from plr.controlplane.core.estimate.network import PathView, RobotNetwork
-from plr.controlplane.core.estimate.penalties import Penalties
+from plr.controlplane.core.estimate.network import ReportedPath, RobotNetwork
+from plr.controlplane.core.estimate.penalties import ReportedPenalties
 from plr.controlplane.core.estimate.posterior import IGNORANCE, Estimate, FadedTrials
 from plr.controlplane.core.estimate.processing import ComputeTimes, ServerTimes
 from plr.controlplane.core.estimate.shared_fate import SharedFate
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from plr.controlplane.core.estimate.composed import Parts
-    from plr.controlplane.core.estimate.network import PathState
+    from plr.controlplane.core.estimate.network import PathRecord
     from plr.controlplane.core.estimate.shared_fate import CommonMisses
     from plr.protos.model.ids import InterfaceName, NodeName, ServiceName
     from plr.protos.model.mapping import Assignment
@@ -77,7 +77,7 @@ MAX_HISTOGRAMS = 131_072
 have not reported for `LIVE_S` are forgotten, the longest silent first. If there are none, robots that have their equal
 share get no new ones. So no robot that reports loses what another one brings."""
 
-MAX_ROBOTS = 8192
+MAX_ESTIMATED_ROBOTS = 8192
 """Robots kept, including some that left: twice as many as may be registered."""
 
 LIVE_S = 60.0
@@ -158,7 +158,7 @@ class _Robot:
         self.services: OrderedDict[ServiceName, _Service] = OrderedDict()
         self.outcomes: OrderedDict[ServiceName, _Outcomes] = OrderedDict()
         self.late: OrderedDict[ServiceName, LateFate] = OrderedDict()
-        self.penalties = Penalties()
+        self.penalties = ReportedPenalties()
         self.troubles: dict[tuple[ServiceName, float, InterfaceName], InterfaceTrouble] = {}
         """Computed, by service, deadline and interface ..."""
         self.troubles_at = (0, 0.0)
@@ -249,7 +249,7 @@ class Estimator:
 
     def _forget_silent(self, robot: NodeName, now: float) -> None:
         """Make room for this robot's report by forgetting robots that have been silent for long, if any."""
-        while self._histograms >= MAX_HISTOGRAMS or len(self._robots) > MAX_ROBOTS:
+        while self._histograms >= MAX_HISTOGRAMS or len(self._robots) > MAX_ESTIMATED_ROBOTS:
             name, silent = next(iter(self._robots.items()))
             if name == robot or now - silent.heard_at < LIVE_S:
                 return
@@ -313,17 +313,17 @@ class Estimator:
         if tables is not None:
             yield from (state.last for state in tables.network.paths.values())
 
-    def path_states(self, robot: NodeName) -> Mapping[tuple[InterfaceName, NodeName], PathState]:
+    def path_states(self, robot: NodeName) -> Mapping[tuple[InterfaceName, NodeName], PathRecord]:
         """Return what is known of each path of a robot: the table itself, which `forget_paths` leaves to its holder."""
         tables = self._robots.get(robot)
         return tables.network.paths if tables is not None else {}
 
-    def path_views(self, robot: NodeName) -> Iterator[PathView]:
+    def path_views(self, robot: NodeName) -> Iterator[ReportedPath]:
         """Yield each path of a robot as last reported, with its remembered round trips."""
         tables = self._robots.get(robot)
         if tables is not None:
             for key, state in tables.network.paths.items():
-                yield PathView(*key, state.up, state.rtt.median_once(), tables.network.leads_there(key))
+                yield ReportedPath(*key, state.up, state.rtt.median_once(), tables.network.leads_there(key))
 
     def path_up(self, robot: NodeName, interface: InterfaceName, server: NodeName) -> bool | None:
         """Return whether the path was up when last reported; None if it was never reported."""

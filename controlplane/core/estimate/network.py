@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 K = TypeVar("K")
 V = TypeVar("V")
 
-MAX_PATHS = 1024
+MAX_PATHS_PER_ROBOT = 1024
 """Paths kept of one robot; the least recently reported one is evicted."""
 
 MAX_CELLS = 1024
@@ -92,7 +92,7 @@ class Witness(NamedTuple):
 
 
 @dataclass(frozen=True, slots=True)
-class PathView:
+class ReportedPath:
     """One path of a robot, as last reported."""
 
     interface: InterfaceName
@@ -105,7 +105,7 @@ class PathView:
 
 
 @dataclass(slots=True)
-class PathState:
+class PathRecord:
     """Everything known of one path except its requests."""
 
     up: bool
@@ -130,7 +130,7 @@ class RobotNetwork:
 
     def __init__(self, half_life_s: float) -> None:
         self._half_life_s = half_life_s
-        self.paths: OrderedDict[PathKey, PathState] = OrderedDict()
+        self.paths: OrderedDict[PathKey, PathRecord] = OrderedDict()
         self._answered_over: set[InterfaceName] = set()
         """Interfaces over which any server ever answered."""
         self._cells: OrderedDict[CellKey, FadedHistogram] = OrderedDict()
@@ -146,7 +146,7 @@ class RobotNetwork:
         """Round trips that were not measured."""
         self._fresh = False
         """Whether these tables reflect everything merged."""
-        self.most = MAX_PATHS + MAX_CELLS
+        self.most = MAX_PATHS_PER_ROBOT + MAX_CELLS
         """Number of histograms beyond which no new ones are added."""
         self.dropped = 0
         """Entries evicted, or refused, because a table was full."""
@@ -163,13 +163,15 @@ class RobotNetwork:
         if state is None:
             if not self._has_room():
                 return False
-            state = PathState(path.up, FadedHistogram(self._half_life_s, now), FadedCount(self._half_life_s, now), path)
-        self._keep(self.paths, key, state, MAX_PATHS)
+            state = PathRecord(
+                path.up, FadedHistogram(self._half_life_s, now), FadedCount(self._half_life_s, now), path
+            )
+        self._keep(self.paths, key, state, MAX_PATHS_PER_ROBOT)
         changed = known is None or known.up != path.up
         state.up = path.up
         if path.up and not state.answered:
             state.answered = True
-            if len(self._answered_over) < MAX_PATHS:
+            if len(self._answered_over) < MAX_PATHS_PER_ROBOT:
                 self._answered_over.add(path.interface)
         state.last = path
         state.rtt.add(path.rtt, now)

@@ -19,7 +19,7 @@ LONGEST_S = 600.0
 """No sidecar penalises a server for longer (`plr.sidecar.core.robot.dispatch.penalties`), whatever it reports."""
 
 
-class Penalties:
+class ReportedPenalties:
     """Penalties that one robot reported last, and until when they hold. Times are monotonic seconds."""
 
     __slots__ = ("_until",)

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from plr.protos.model.ids import NodeName
 
-MAX_PAIRS = 131_072
+MAX_REACHED_PAIRS = 131_072
 """Pairs of robot and server remembered, also of robots that are gone: as many as 4,096 robots and 32 servers make. The
 one that reached longest ago is evicted."""
 
@@ -41,7 +41,7 @@ class Reached:
             return
         self._servers_of.setdefault(robot, set()).add(server)
         self._robots_of[server] += 1
-        if len(self._pairs) > MAX_PAIRS:
+        if len(self._pairs) > MAX_REACHED_PAIRS:
             self._drop(*next(iter(self._pairs)))
             self.forgotten += 1
 

@@ -12,7 +12,7 @@ from plr.controlplane.core.problem.costs import block_cost, charge, choice_costs
 from plr.controlplane.core.problem.domains import shared_domains
 from plr.controlplane.core.problem.plan import choice_of
 from plr.controlplane.core.problem.problem import FleetKey, block_excess, loads, reachable
-from plr.controlplane.core.solve.enumeration import MAX_LISTED, list_choices, own_excess
+from plr.controlplane.core.solve.enumeration import MAX_LISTED_CHOICES, list_choices, own_excess
 from plr.protos.model.explanation import Alternative, AlternativeKind
 from plr.protos.model.mapping import Assignment
 
@@ -50,7 +50,7 @@ class _Alternatives:
         self._block = block
         self._running = running
         self._taken = _taken_by_others(problem, plan, block)
-        choices = list_choices(block, MAX_LISTED).choices
+        choices = list_choices(block, MAX_LISTED_CHOICES).choices
         costs = choice_costs(problem.objective, block, choices)
         self._choices = choices[np.lexsort((costs, own_excess(block, choices)))]
 

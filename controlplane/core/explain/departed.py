@@ -19,7 +19,7 @@ from plr.protos.model.members import RemovalReason
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
 
-    from plr.controlplane.core.estimate.network import PathState
+    from plr.controlplane.core.estimate.network import PathRecord
     from plr.controlplane.core.formulation.block import BlockNotes, Picture
     from plr.controlplane.core.problem.plan import BlockPlan, Plan
     from plr.controlplane.core.problem.problem import Objective
@@ -58,7 +58,7 @@ class LastKnown:
     """What a robot's mapping was, and what it rested on, when it left."""
 
     sidecar: Sidecar
-    paths: Mapping[tuple[InterfaceName, NodeName], PathState]
+    paths: Mapping[tuple[InterfaceName, NodeName], PathRecord]
     mapping: tuple[ServiceMapping, ...]
     sync: ResourceStatus
     plans: Mapping[BlockKey, BlockPlan]
@@ -84,7 +84,7 @@ class Departure:
 def last_known(
     robot: Sidecar,
     snapshots: Snapshots,
-    paths: Mapping[tuple[InterfaceName, NodeName], PathState],
+    paths: Mapping[tuple[InterfaceName, NodeName], PathRecord],
     picture: Picture,
     plan: Plan,
 ) -> LastKnown:

@@ -41,7 +41,7 @@ LEVEL = 0.9
 MIN_COMMON_REQUESTS = 20.0
 """Requests over two interfaces below which nothing is reported of these."""
 
-MAX_PAIRS = 1024
+MAX_SHOWN_PAIRS = 1024
 """Pairs reported, those in use and then the best ones: what the estimator keeps of one robot."""
 
 
@@ -169,7 +169,7 @@ def explain(
         target_miss=use.target_miss,
         cost_per_request=_cost_per_request(block, planned),
         pairs=_pairs(paths, notes, block, estimator, key, mapping, now),
-        pairs_left_out=max(0, len(paths) - MAX_PAIRS),
+        pairs_left_out=max(0, len(paths) - MAX_SHOWN_PAIRS),
         joints=_joints(robot.name, use.name, block, estimator, now),
         alternatives=alternatives.of(picture.problem, plan, block, miss) if block is not None else (),
         changes=_changes(history, now),
@@ -203,7 +203,7 @@ def _pairs(
 
     penalties = estimator.penalties(key.robot, now)
     found: list[PairExplanation] = []
-    for path in sorted(paths, key=rank)[:MAX_PAIRS]:
+    for path in sorted(paths, key=rank)[:MAX_SHOWN_PAIRS]:
         penalty = penalties.get(path.server)
         evidence = estimator.evidence(key.robot, path, key.service, now)
         found.append(

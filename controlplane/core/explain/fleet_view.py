@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from plr.controlplane.core.estimate.estimator import Estimator
-    from plr.controlplane.core.estimate.network import PathView
+    from plr.controlplane.core.estimate.network import ReportedPath
     from plr.controlplane.core.estimate.reached import Reached
     from plr.controlplane.core.estimate.unanswered import Unanswered
     from plr.controlplane.core.formulation.block import Picture
@@ -77,7 +77,7 @@ class MemberView:
     role: Role
     connected: bool
     seen_at: float
-    paths: tuple[PathView, ...] = ()
+    paths: tuple[ReportedPath, ...] = ()
     mapping: tuple[ServiceMapping, ...] = ()
     misses: tuple[MissView, ...] = ()
     interfaces: tuple[InterfaceView, ...] = ()
@@ -128,7 +128,7 @@ def view_of(
     down = (label for label in sidecar.down if label.interface not in carriers)
     interfaces += (InterfaceView(label.interface, label.carrier or label.interface, up=False) for label in down)
     servers: dict[NodeName, bool] = {}
-    found: list[PathView] = []
+    found: list[ReportedPath] = []
     for path in estimator.path_views(sidecar.name):
         there = servers.get(path.server)
         if there is None:

@@ -25,7 +25,7 @@ TEXT = "it was there before the control plane was restarted, but did not come ba
 ENOUGH_WITNESSES = 2
 """Robots that must say that a server said goodbye, if as many may call it."""
 
-MAX_WITNESSES = 8
+MAX_NAMED_WITNESSES = 8
 """Robots named; what further ones say is no news."""
 
 
@@ -64,7 +64,7 @@ class Returning:
         if (awaited is None or awaited.role is not Role.CLOUD) and server not in self._given_up:
             return False
         witnesses = self._witnesses.setdefault(server, [])
-        if robot in witnesses or len(witnesses) >= MAX_WITNESSES:
+        if robot in witnesses or len(witnesses) >= MAX_NAMED_WITNESSES:
             return False
         witnesses.append(robot)
         return server in self._given_up

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
     from plr.controlplane.core.estimate.estimator import Estimator
     from plr.controlplane.core.problem.mode_miss import PairTiming
-    from plr.controlplane.core.problem.problem import Path
+    from plr.controlplane.core.problem.problem import PairIndex
     from plr.controlplane.core.registry.registry import Sidecar
     from plr.protos.model.ids import InterfaceName, NodeName, ServiceName
     from plr.protos.model.members import ServiceUse
@@ -212,9 +212,9 @@ def _lifts(
     epsilons: tuple[tuple[float | None, ...], ...],
     estimator: Estimator,
     now: float,
-) -> dict[tuple[Path, Path], float]:
+) -> dict[tuple[PairIndex, PairIndex], float]:
     """Return how much more often than by chance two paths over different interfaces miss together, where measured."""
-    lifts: dict[tuple[Path, Path], float] = {}
+    lifts: dict[tuple[PairIndex, PairIndex], float] = {}
     row = {interface: number for number, interface in enumerate(interfaces)}
     column = {server: number for number, server in enumerate(servers)}
     for first, second in estimator.raced_together(key.robot, key.service):

@@ -40,7 +40,7 @@ pictures. So a robot that names many interfaces and services delays no other rob
 USE_PAIRS = 1024
 """Pairs of one use: as many as the estimator keeps."""
 
-MAX_INTERFACES = 64
+MAX_CONSIDERED_INTERFACES = 64
 """Interfaces of one robot that are considered, the first that it names; fewer if there are many servers, ..."""
 
 LEAST_INTERFACES = 16
@@ -487,7 +487,9 @@ def _inputs(
     path_rules: PathRules,
 ) -> _Inputs:
     """Return the inputs of a use: of those `offering` the service, the robot may call it on `clouds`."""
-    interfaces = interfaces_of(robot)[: max(LEAST_INTERFACES, min(MAX_INTERFACES, USE_PAIRS // max(1, len(clouds))))]
+    interfaces = interfaces_of(robot)[
+        : max(LEAST_INTERFACES, min(MAX_CONSIDERED_INTERFACES, USE_PAIRS // max(1, len(clouds))))
+    ]
     barred = path_rules.barred(robot.name, interfaces, [cloud.name for cloud in clouds])
     if not offering:
         unserved = f"no live server offers it as {use.type}"

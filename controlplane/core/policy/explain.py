@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from plr.protos.model.ids import NodeName, ServiceName
 
 
-MAX_CLOSE = 5
+MAX_NAMED_RULES = 5
 """Number of rules named that all but allow a call, the first ones."""
 
 
@@ -47,7 +47,7 @@ def _offer_reasons(policy: Policy, service: ServiceName, cloud: NodeName) -> Ite
         for number, rule in enumerate(policy.offers)
         if matches(cloud, rule.clouds) or matches(service, rule.services)
     )
-    yield from islice(close, MAX_CLOSE)
+    yield from islice(close, MAX_NAMED_RULES)
 
 
 def _call_reasons(policy: Policy, robot: NodeName, service: ServiceName, cloud: NodeName) -> Iterator[str]:
@@ -63,4 +63,4 @@ def _call_reasons(policy: Policy, robot: NodeName, service: ServiceName, cloud: 
         for number, rule in enumerate(policy.calls)
         if matches(robot, rule.robots) + matches(service, rule.services) + matches(cloud, rule.clouds) == 2
     )
-    yield from islice(close, MAX_CLOSE)
+    yield from islice(close, MAX_NAMED_RULES)

@@ -9,8 +9,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from plr.controlplane.core.policy.patterns import PatternIndex
-from plr.controlplane.core.registry.registry import MAX_SIDECARS
-from plr.protos.model.members import ALL_CALLS, NO_POLICY, CallPermit
+from plr.protos.model.members import ALL_CALLS, MAX_SIDECARS, NO_POLICY, CallPermit
 
 if TYPE_CHECKING:
     from plr.controlplane.core.policy.policy import Policy

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from plr.protos.model.ids import NodeName, ServiceName
 
-MAX_TOLD = 1024
+MAX_REPORTED_OFFERS = 1024
 """Services of one cloud that are reported: as many as it may offer at once. Further ones are only counted."""
 
 
@@ -21,7 +21,7 @@ class RefusedOffers:
         """Take all that a cloud offers and may not; return how many are new, and those to report."""
         told = self._told.get(cloud, set())
         new = [service for service in refused if service not in told]
-        untold = tuple(new[: MAX_TOLD - len(told)])
+        untold = tuple(new[: MAX_REPORTED_OFFERS - len(told)])
         if untold:
             self._told[cloud] = told | set(untold)
         return len(new), untold

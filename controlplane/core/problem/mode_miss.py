@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from plr.controlplane.core.problem.plan import BlockPlan
-    from plr.controlplane.core.problem.problem import Block, Choice, Path
+    from plr.controlplane.core.problem.problem import Block, Choice, PairIndex
     from plr.protos.model.ids import InterfaceName, NodeName
     from plr.protos.model.members import ServiceUse
 
@@ -129,7 +129,9 @@ def miss_of(use: ServiceUse, block: Block, choice: Choice, sending: Sending) -> 
     return max(at_once, sum(of[path].carried / carried * miss for path, miss in each.items()))
 
 
-def _from(first: Path, of: Mapping[Path, PairTiming], use: ServiceUse, block: Block, sending: Sending) -> float:
+def _from(
+    first: PairIndex, of: Mapping[PairIndex, PairTiming], use: ServiceUse, block: Block, sending: Sending
+) -> float:
     """Return the same for requests that go over this pair first."""
     alone = _epsilon(block, first)
     if not use.redundancy.helps:
@@ -139,7 +141,7 @@ def _from(first: Path, of: Mapping[Path, PairTiming], use: ServiceUse, block: Bl
     return alone * missed / (TOGETHER_MISSES + sending.first_missed)
 
 
-def _second_misses(first: Path, of: Mapping[Path, PairTiming], use: ServiceUse, block: Block) -> float:
+def _second_misses(first: PairIndex, of: Mapping[PairIndex, PairTiming], use: ServiceUse, block: Block) -> float:
     """Return how likely no other copy is in time when the first one is not, before outcomes tell."""
     if not use.redundancy.sends_late or use.budgeted:
         return 1.0
@@ -154,5 +156,5 @@ def _rank(timing: PairTiming, epsilon: float) -> float:
     return (timing.carried * epsilon + UNTRIED_MISSES) / (timing.carried + UNTRIED_REQUESTS)
 
 
-def _epsilon(block: Block, path: Path) -> float:
+def _epsilon(block: Block, path: PairIndex) -> float:
     return max(block.epsilon[path[0]][path[1]] or 0.0, PROBABILITY_FLOOR)

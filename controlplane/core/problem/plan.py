@@ -95,18 +95,18 @@ def size(costs: Sequence[float] | NDArray[np.float64]) -> float:
 
 
 @dataclass(frozen=True, order=True, slots=True)
-class Price:
+class PlanCost:
     """Cost of a plan, ordered: first keep to the capacities, then cost little (`costs`)."""
 
     excess: int
     cost: float
 
 
-def price(problem: Problem, choices: Mapping[BlockKey, Choice]) -> Price:
+def price(problem: Problem, choices: Mapping[BlockKey, Choice]) -> PlanCost:
     """Return the cost of choices, each of which must be valid."""
     excess = sum(block_excess(block, choices[block.key]) for block in problem.blocks)
     excess += sum(fleet_excess(problem, choices).values())
-    return Price(excess, sum(block_cost(problem.objective, block, choices[block.key]) for block in problem.blocks))
+    return PlanCost(excess, sum(block_cost(problem.objective, block, choices[block.key]) for block in problem.blocks))
 
 
 def make_plan(

@@ -57,7 +57,7 @@ class Objective(enum.Enum):
     """The logarithm of the probability that all miss, with the measured lift of each pair of paths."""
 
 
-Path = tuple[int, int]
+PairIndex = tuple[int, int]
 """Indices of an interface and of a server in a block."""
 
 
@@ -83,7 +83,7 @@ class Block:
     capacity: int = 1
     """Interfaces of this block that may share a server; 0 means no limit."""
     idempotent: bool = True
-    lifts: Mapping[tuple[Path, Path], float] = field(default_factory=dict)
+    lifts: Mapping[tuple[PairIndex, PairIndex], float] = field(default_factory=dict)
     """P(both miss) / (epsilon_1 epsilon_2) of two paths, that of the lower interface first; 1 if not named."""
     weights: tuple[tuple[float, ...], ...] = ()
     """By interface, then server: how many independent requests that epsilon is worth; empty if all are exact."""
@@ -101,7 +101,7 @@ class Block:
         """Number of copies, for the present number of interfaces."""
         return self.copies.over(len(self.interfaces))
 
-    def estimate(self, path: Path) -> Estimate | None:
+    def estimate(self, path: PairIndex) -> Estimate | None:
         """Return what is believed of a path's miss probability; None if there is no path, or its epsilon is exact."""
         interface, server = path
         epsilon = self.epsilon[interface][server]

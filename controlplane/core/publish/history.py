@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from plr.protos.model.ids import NodeName, Version
     from plr.protos.model.mapping import MappingSet, ServiceMapping
 
-MAX_CHANGES = 8
+MAX_REMEMBERED_CHANGES = 8
 """Changes remembered of one robot's service: two minutes of the maximum rate of changes for the better."""
 
 MAX_HISTORIES = 8192
@@ -34,7 +34,7 @@ class History:
 
     since: float
     """When its requests last changed their destinations."""
-    changes: deque[SentMapping] = field(default_factory=lambda: deque(maxlen=MAX_CHANGES))
+    changes: deque[SentMapping] = field(default_factory=lambda: deque(maxlen=MAX_REMEMBERED_CHANGES))
 
 
 class MappingHistory:

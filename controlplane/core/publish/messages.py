@@ -22,7 +22,7 @@ class CloseReason(enum.Enum):
 
 
 @dataclass(frozen=True, slots=True)
-class Send:
+class SendMessage:
     """A message for one stream; a newer one of the same type makes an unsent older one pointless."""
 
     stream: StreamId
@@ -30,7 +30,7 @@ class Send:
 
 
 @dataclass(frozen=True, slots=True)
-class Close:
+class EndStream:
     """End this stream."""
 
     stream: StreamId

@@ -24,13 +24,12 @@ from collections import OrderedDict
 from typing import TYPE_CHECKING
 
 from plr.controlplane.core.publish import mappings
-from plr.controlplane.core.publish.messages import Send
+from plr.controlplane.core.publish.messages import SendMessage
 from plr.controlplane.core.publish.snapshots import PeerView, Snapshots, VersionSource
 from plr.controlplane.core.publish.told_peers import ToldPeers
 from plr.controlplane.core.publish.views import KnownPeers, Views
-from plr.controlplane.core.registry.registry import MAX_SIDECARS
 from plr.protos.model.ids import Role, Version
-from plr.protos.model.members import POLICY_PENDING
+from plr.protos.model.members import MAX_SIDECARS, POLICY_PENDING
 from plr.protos.model.stream import ResourceKind
 
 if TYPE_CHECKING:
@@ -184,7 +183,7 @@ class Publisher:
         self._due.update(self._uninformed)
         self._uninformed.clear()
 
-    def publish(self, permits: Permits, plan: Plan, picture: Picture, now: float) -> Iterator[Send | None]:
+    def publish(self, permits: Permits, plan: Plan, picture: Picture, now: float) -> Iterator[SendMessage | None]:
         """Yield everything that is news to somebody, and None before each sidecar, for other work in between.
 
         Clouds come first: what a robot learns that it may call must be refused nowhere.
@@ -220,7 +219,7 @@ class Publisher:
 
     def publish_plan(
         self, robots: Iterable[NodeName], permits: Permits, plan: Plan, picture: Picture, now: float
-    ) -> Iterator[Send | None]:
+    ) -> Iterator[SendMessage | None]:
         """Yield the mappings of these robots that are news; the members have not changed since `publish`."""
         views = Views(self._registry, permits, self._known_peers)
         for name in robots:
@@ -235,7 +234,7 @@ class Publisher:
             return True
         return self.waits(sidecar.name)
 
-    def _peers(self, sidecar: Sidecar, stream: StreamId, views: Views, permits: Permits) -> Iterator[Send]:
+    def _peers(self, sidecar: Sidecar, stream: StreamId, views: Views, permits: Permits) -> Iterator[SendMessage]:
         snapshots = self._snapshots[sidecar.name]
         judged = self.warm_until is None or not permits.restricted
         view = PeerView(views.peers_of(sidecar), permits.fingerprint if judged else POLICY_PENDING)
@@ -246,11 +245,11 @@ class Publisher:
         peers = views.changes(sent.peers, sidecar) if base and sent is not None else view.peers
         told = ToldPeers(peers, sidecar.name, sidecar.role)
         removed = views.removed(sidecar, snapshots.known_names)
-        yield Send(stream, snapshots.send_peers(view, told, removed, base, self._versions))
+        yield SendMessage(stream, snapshots.send_peers(view, told, removed, base, self._versions))
 
     def _mapping(
         self, robot: Sidecar, stream: StreamId, views: Views, plan: Plan, picture: Picture, now: float
-    ) -> Iterator[Send]:
+    ) -> Iterator[SendMessage]:
         snapshots = self._snapshots[robot.name]
         sent = snapshots.mapping.sent
         mapping = mappings.mapping_of(robot, views.servers_of(robot.name), plan, picture, sent or ())
@@ -266,7 +265,7 @@ class Publisher:
                     self._uninformed.add(robot.name)
                     self.inform_at = min(inform_at, self.inform_at or inform_at)
         if worth_sending:
-            yield Send(stream, snapshots.send_mapping(mapping, self._versions, now))
+            yield SendMessage(stream, snapshots.send_mapping(mapping, self._versions, now))
 
     def sync_states(self) -> Iterator[tuple[NodeName, ResourceKind, SyncState]]:
         """Yield how far every registered sidecar follows; clouds get no mapping."""

@@ -15,7 +15,15 @@ from typing import TYPE_CHECKING, NewType
 from plr.controlplane.core.overload.postponed import Postponed
 from plr.controlplane.core.overload.registration_share import RegistrationShare
 from plr.protos.model.ids import NodeName, Role
-from plr.protos.model.members import NO_REVOCATIONS, CandidateSet, Peer, Registration, RemovalReason, RevocationSet
+from plr.protos.model.members import (
+    MAX_SIDECARS,
+    NO_REVOCATIONS,
+    CandidateSet,
+    Peer,
+    Registration,
+    RemovalReason,
+    RevocationSet,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterator
@@ -26,10 +34,7 @@ if TYPE_CHECKING:
 StreamId = NewType("StreamId", int)
 """Number of one stream, unique in one run of the control plane."""
 
-MAX_SIDECARS = 4096
-"""Sidecars known at once: as many as one set of peers holds. A further one is refused, not let in for another."""
-
-MAX_OFFERED = 1024
+MAX_REMEMBERED_OFFERS = 1024
 """Service names remembered for one cloud, as many as it may offer at once. Beyond that, only its present offers."""
 
 MAX_REMEMBERED_REMOVALS = 4096
@@ -65,7 +70,7 @@ class Refusal(enum.Enum):
 
 
 @dataclass(frozen=True, slots=True)
-class Admission:
+class AcceptedRegistration:
     """An accepted registration; `replaced` is the stream that has to end for it."""
 
     replaced: StreamId | None
@@ -85,9 +90,9 @@ class Sidecar:
     """None until announced."""
     draining: bool = False
     offered: frozenset[ServiceName] = frozenset()
-    """Services it has offered since it registered, at most MAX_OFFERED."""
+    """Services it has offered since it registered, at most MAX_REMEMBERED_OFFERS."""
     carried: frozenset[ServiceName] = frozenset()
-    """Services it has carried in this run since it registered, at most MAX_OFFERED."""
+    """Services it has carried in this run since it registered, at most MAX_REMEMBERED_OFFERS."""
     labels: tuple[InterfaceLabel, ...] = ()
     """What a robot says of its interfaces."""
     down: tuple[InterfaceLabel, ...] = ()
@@ -163,8 +168,8 @@ class Sidecar:
         return replace(
             self,
             services=told,
-            offered=offered if len(offered) <= MAX_OFFERED else now_offered,
-            carried=carried if len(carried) <= MAX_OFFERED else now_carried,
+            offered=offered if len(offered) <= MAX_REMEMBERED_OFFERS else now_offered,
+            carried=carried if len(carried) <= MAX_REMEMBERED_OFFERS else now_carried,
         )
 
     @property
@@ -250,7 +255,7 @@ class Registry:
         """Return the sidecar of that name."""
         return self._sidecars.get(name)
 
-    def register(self, registration: Registration, stream: StreamId, now: float) -> Admission | Refusal:
+    def register(self, registration: Registration, stream: StreamId, now: float) -> AcceptedRegistration | Refusal:
         """Let a sidecar in, or say why not.
 
         A name belongs to the token that took it first for as long as its lease lasts, and within a token to the newest
@@ -270,7 +275,7 @@ class Registry:
             self._leases[name] = _Lease(self.lease_s, now + self.lease_s, now)
             self._sessions[registration.session] = name
             self._await_end(name)
-            return Admission(replaced=None, new_run=True)
+            return AcceptedRegistration(replaced=None, new_run=True)
         before = known.registration
         if registration.token != before.token:
             return self._refuse(Refusal.NAME_TAKEN)
@@ -287,7 +292,7 @@ class Registry:
         del self._sessions[before.session]
         self._sessions[registration.session] = name
         self._leases[name] = _Lease(self.lease_s, now + self.lease_s, now)
-        return Admission(replaced=known.stream, new_run=not same_run)
+        return AcceptedRegistration(replaced=known.stream, new_run=not same_run)
 
     def remove(self, name: NodeName, reason: RemovalReason) -> Sidecar | None:
         """Remove it, whatever its lease; return it as it was, or None if it was not there."""

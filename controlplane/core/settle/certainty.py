@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from plr.controlplane.core.problem.problem import Block, Choice, Path
+    from plr.controlplane.core.problem.problem import Block, Choice, PairIndex
 
 DRAWS = 128
 """Draws of every unknown epsilon: the resulting probability is accurate to 0.05."""
@@ -55,11 +55,11 @@ def probability_met(block: Block, choice: Choice) -> float:
     return float(np.mean(log_miss <= math.log(block.target.miss) + TARGET_TOLERANCE))
 
 
-def _paths(choice: Choice) -> set[Path]:
+def _paths(choice: Choice) -> set[PairIndex]:
     return {(interface, server) for interface, server in enumerate(choice) if server is not None}
 
 
-def _off_mean(objective: Objective, block: Block, path: Path, rng: np.random.Generator) -> NDArray[np.float64]:
+def _off_mean(objective: Objective, block: Block, path: PairIndex, rng: np.random.Generator) -> NDArray[np.float64]:
     """Return by how much more than expected a path costs, in each draw."""
     estimate = block.estimate(path)
     if estimate is None:

@@ -38,7 +38,7 @@ class _Kept(NamedTuple):
     pair: Assignment | None
 
 
-class Exploration:
+class ExploredPairs:
     """What each block explores, from one solution to the next."""
 
     def __init__(self) -> None:

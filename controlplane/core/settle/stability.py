@@ -41,7 +41,7 @@ SURE_ENOUGH = 0.7
 """Minimum probability that the new choice is better. On recorded networks 0.9 halves the changes that 0.5 makes, but
 misses a twentieth more deadlines, as a path that became bad is kept too long; 0.7 costs a hundredth."""
 
-MAX_CHANGES = 4
+MAX_MOVES = 4
 CHANGE_WINDOW_S = 60.0
 """Maximum moves of a robot's service to something better in this window. What died, or has no room, is left at once."""
 
@@ -98,7 +98,7 @@ class Stability:
                 choices[key] = difference.new
                 if key in running.blocks:
                     why[key] = _reason(difference)
-                    self._changed.setdefault(key, deque(maxlen=MAX_CHANGES)).append(now)
+                    self._changed.setdefault(key, deque(maxlen=MAX_MOVES)).append(now)
         plan = make_plan(problem, choices, bound=new.bound, unproven=new.unproven, before=running.blocks)
         return replace(plan, blocks={key: _said(block, running, why) for key, block in plan.blocks.items()})
 
@@ -117,7 +117,7 @@ class Stability:
         if _leaves_hopeless(difference):
             return False
         times = self._changed.get(difference.block.key, ())
-        return sum(now - time < CHANGE_WINDOW_S for time in times) >= MAX_CHANGES
+        return sum(now - time < CHANGE_WINDOW_S for time in times) >= MAX_MOVES
 
 
 def _leaves_hopeless(difference: _Difference) -> bool:

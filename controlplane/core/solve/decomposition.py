@@ -22,7 +22,7 @@ from plr.controlplane.core.problem.domains import chooses_interfaces, has_shared
 from plr.controlplane.core.problem.plan import relative_gap
 from plr.controlplane.core.problem.problem import Objective
 from plr.controlplane.core.solve.batch import EnumeratedStack, SeparableStack
-from plr.controlplane.core.solve.enumeration import MAX_LISTED, OWN_EXCESS_PRICE
+from plr.controlplane.core.solve.enumeration import MAX_LISTED_CHOICES, OWN_EXCESS_PRICE
 from plr.controlplane.core.solve.incumbent import Standing
 from plr.controlplane.core.solve.pattern_batch import PatternStack
 
@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 
     Floats = NDArray[np.float64]
 
-MAX_STEPS = 300
+MAX_SUBGRADIENT_STEPS = 300
 STEPS_BETWEEN_PLANS = 12
 """Steps between plans: a plan costs as much as some steps."""
 PATIENCE_STEPS = 8
@@ -69,7 +69,7 @@ class Kind(enum.Enum):
 def stack_blocks(objective: Objective, blocks: Sequence[Block], limits: Limits) -> list[Stack]:
     """Stack blocks by shape and kind."""
     listed = [block for block in blocks if block.idempotent and not _adds_up(objective, block)]
-    at_most = min(MAX_LISTED, max(MIN_LISTED, MAX_LISTED_ALL // max(1, len(listed))))
+    at_most = min(MAX_LISTED_CHOICES, max(MIN_LISTED, MAX_LISTED_ALL // max(1, len(listed))))
     shapes: dict[tuple[Kind, bool, int], list[Block]] = {}
     for block in blocks:
         shape = _kind(objective, block, at_most), block.idempotent, len(block.interfaces)
@@ -84,7 +84,7 @@ def _stack(kind: Kind, objective: Objective, blocks: Sequence[Block], limits: Li
         case Kind.ENUMERATED:
             return EnumeratedStack(objective, blocks, limits, at_most=at_most)
         case Kind.PATTERNS:
-            at_most = min(MAX_LISTED, max(MIN_LISTED, MAX_PATTERNS_ALL // len(blocks)))
+            at_most = min(MAX_LISTED_CHOICES, max(MIN_LISTED, MAX_PATTERNS_ALL // len(blocks)))
             return PatternStack(objective, blocks, limits, at_most=at_most)
 
 
@@ -159,7 +159,7 @@ class Decomposition:
 
     def _climb(self, good_gap: float, out_of_time: Callable[[], bool]) -> None:
         price, length, waited = self.start, 1.0, 0
-        for step in range(MAX_STEPS):
+        for step in range(MAX_SUBGRADIENT_STEPS):
             value, best = self._dual(price)
             if value > self._bound:
                 self._bound, self._price, waited = value, price, 0

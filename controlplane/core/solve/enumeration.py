@@ -27,7 +27,7 @@ OWN_EXCESS_PRICE = 1e6
 MOST_DIMENSIONS = 32
 """Limit on the dimensions of numpy's arrays, by some of its functions."""
 
-MAX_LISTED = 4096
+MAX_LISTED_CHOICES = 4096
 """Choices examined of one block: 2 interfaces with 64 servers, 3 with 16, 4 with 8."""
 
 TRIED_A_CHOICE = 16
@@ -155,7 +155,7 @@ def lift_floor(block: Block) -> float:
 
 def tried_of_each(interfaces: int, at_most: int) -> int:
     """Return how many servers of each interface to combine, to find `at_most` choices near the best."""
-    return max(1, int(min(MAX_LISTED, TRIED_A_CHOICE * at_most) ** (1 / interfaces) + 1e-9))
+    return max(1, int(min(MAX_LISTED_CHOICES, TRIED_A_CHOICE * at_most) ** (1 / interfaces) + 1e-9))
 
 
 def nearest(values: Floats, excess: Indices, picks: Indices, margin: float, at_most: int, *, complete: bool) -> Near:

@@ -18,7 +18,7 @@ from plr.controlplane.core.problem.costs import RULE_PRICE
 from plr.controlplane.core.solve.batch import Best, Stack
 from plr.controlplane.core.solve.batch_costs import StackedCosts
 from plr.controlplane.core.solve.enumeration import (
-    MAX_LISTED,
+    MAX_LISTED_CHOICES,
     OWN_EXCESS_PRICE,
     TRIED_A_CHOICE,
     combinations,
@@ -205,7 +205,7 @@ class PatternStack(Stack):
     def _near_picks(self, row: int, priced: Floats, at_most: int) -> Indices:
         """For each set of interfaces that may carry the copies, return every way to take one of the cheapest servers of
         each. If there are too many sets, use those of the cheapest interfaces."""
-        tried = min(MAX_LISTED, TRIED_A_CHOICE * at_most)
+        tried = min(MAX_LISTED_CHOICES, TRIED_A_CHOICE * at_most)
         ways = self._ways(row, priced, tried)
         share = max(1, min(self.servers, max(tried_of_each(len(way), at_most) for way in ways)))
         while share > 1 and sum(share ** len(way) for way in ways) > tried:

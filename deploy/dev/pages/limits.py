@@ -96,15 +96,31 @@ def _files() -> tuple[str, ...]:
 
 @functools.cache
 def _constants_of(file: str) -> dict[str, float]:
-    """Return the module-level constants that are numbers, or arithmetic on numbers.
+    """Return the module-level constants that are numbers, or arithmetic on numbers and on such constants.
 
     The module is not imported: some need ROS.
     """
     found: dict[str, float] = {}
+    imported: dict[str, float] = {}
     for node in ast.parse((ROOT / file).read_text(encoding="utf-8")).body:
-        if isinstance(node, ast.Assign) and isinstance(node.targets[0], ast.Name):
-            if not any(isinstance(part, ast.Name | ast.Call) for part in ast.walk(node.value)):
-                value = eval(compile(ast.Expression(node.value), file, "eval"))  # noqa: S307 - literals of our own
+        if isinstance(node, ast.ImportFrom):
+            imported.update(_imported_by(node))
+        elif isinstance(node, ast.Assign) and isinstance(node.targets[0], ast.Name):
+            known = imported | found
+            parts = list(ast.walk(node.value))
+            names = {part.id for part in parts if isinstance(part, ast.Name)}
+            if names <= known.keys() and not any(isinstance(part, ast.Call) for part in parts):
+                value = eval(compile(ast.Expression(node.value), file, "eval"), known)  # noqa: S307 - our own arithmetic
                 if isinstance(value, int | float):
                     found[node.targets[0].id] = value
     return found
+
+
+def _imported_by(node: ast.ImportFrom) -> dict[str, float]:
+    """Return the constants among what this statement imports from our packages."""
+    file = f"{(node.module or '').removeprefix('plr.').replace('.', '/')}.py"
+    names = [one.name for one in node.names if one.name.isupper()]
+    if not names or not (ROOT / file).is_file():
+        return {}
+    constants = _constants_of(file)
+    return {name: constants[name] for name in names if name in constants}

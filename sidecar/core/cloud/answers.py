@@ -22,7 +22,7 @@ from plr.sidecar.core.base.request_id import is_race
 from plr.sidecar.core.base.slices import in_groups
 from plr.sidecar.core.base.timers import first_of
 from plr.sidecar.core.base.values import PathState, Priority, RejectReason
-from plr.sidecar.core.cloud.executions import Waiter
+from plr.sidecar.core.cloud.executions import ReplyTo
 from plr.sidecar.core.transfer.room import Lane
 from plr.sidecar.core.transfer.waiting_line import WaitingLine
 from plr.sidecar.core.wire.messages import RejectionMessage, ResponseMessage, encode_message
@@ -75,7 +75,7 @@ class _Answer:
 
     @property
     def robot(self) -> NodeName:
-        return self.reply.waiter.path.peer
+        return self.reply.to.path.peer
 
     @property
     def request_id(self) -> RequestId:
@@ -152,26 +152,26 @@ class Answers:
             self._take(reply, now)
         for reply in replies:
             # As many as came: these, or others that have waited longer. A robot without room has none for a second one.
-            self._send_next(reply.waiter.path.peer, now)
-        self._let_go((reply.waiter.path.peer for reply in replies), now)
+            self._send_next(reply.to.path.peer, now)
+        self._let_go((reply.to.path.peer for reply in replies), now)
 
     def _send_alone(self, reply: Reply, now: float) -> bool:
         """Send a reply at once if nothing waits for its robot; return False if it has to wait or is known."""
-        path = reply.waiter.path
+        path = reply.to.path
         if path.peer in self._lines or self._known(path.peer, reply) is not None:
             return False
         answer = self._enter(reply, now)
         if answer is None:
             return True  # counted
-        answer.waiting[reply.waiter.copy] = path
+        answer.waiting[reply.to.copy] = path
         if self._outbox.has_room(path.peer, answer.size):
-            self._send(answer, reply.waiter.copy)
+            self._send(answer, reply.to.copy)
         else:
             self._line_up(answer)
         return True
 
     def _take(self, reply: Reply, now: float) -> None:
-        copy, path = reply.waiter.copy, reply.waiter.path
+        copy, path = reply.to.copy, reply.to.path
         answer = self._known(path.peer, reply)
         if answer is None:
             answer = self._enter(reply, now)
@@ -216,7 +216,7 @@ class Answers:
 
     def _refusal(self, answer: _Answer, why: str) -> Reply:
         text = f"the request ran, but its answer of {answer.held} bytes is not sent: {why}"
-        rejection = RejectionMessage(answer.request_id, answer.reply.waiter.copy, RejectReason.FORGOTTEN, text)
+        rejection = RejectionMessage(answer.request_id, answer.reply.to.copy, RejectReason.FORGOTTEN, text)
         # The answer's deadline may be over; the rejection is useful until `expires`, and waits behind no large answer.
         return replace(answer.reply, message=rejection, priority=Priority.HIGH, deadline=answer.reply.expires)
 
@@ -422,6 +422,6 @@ class Answers:
     def _refusals(self, answer: _Answer) -> list[Reply]:
         refusal = self._refusal(answer, "no part of it could be sent before its time was nearly over")
         return [
-            replace(refusal, waiter=Waiter(path, copy), message=replace(refusal.message, copy=copy))
+            replace(refusal, to=ReplyTo(path, copy), message=replace(refusal.message, copy=copy))
             for copy, path in {**answer.sent, **answer.waiting}.items()
         ]

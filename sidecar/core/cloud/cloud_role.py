@@ -11,7 +11,7 @@ from plr.protos.model.report import Report
 from plr.sidecar.core.base.slices import in_groups
 from plr.sidecar.core.base.values import RejectReason
 from plr.sidecar.core.cloud.answers import Answers
-from plr.sidecar.core.cloud.executions import ExecutionTable, Reply, Waiter
+from plr.sidecar.core.cloud.executions import ExecutionTable, Reply, ReplyTo
 from plr.sidecar.core.cloud.forbidden_calls import ForbiddenCalls
 from plr.sidecar.core.rules.service_rule import MAX_LIFETIME_S
 from plr.sidecar.core.seam.application import ExecuteRequest
@@ -119,8 +119,8 @@ class CloudRole:
     def _on_request(self, path: PathId, message: RequestMessage, now: float) -> None:
         refusal = self._refusal(path.peer, message, now)
         if refusal and not self.executions.knows(path.peer, message.request_id):
-            waiter = Waiter(path, message.copy)
-            self.answers.send([self.executions.refuse_unseen(waiter, message, *refusal, now)], now)
+            reply_to = ReplyTo(path, message.copy)
+            self.answers.send([self.executions.refuse_unseen(reply_to, message, *refusal, now)], now)
             return
         rule = self._parts.rules.find(message.service)
         patience_s = rule.lifetime_s if rule else MAX_LIFETIME_S

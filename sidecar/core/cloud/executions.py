@@ -45,7 +45,7 @@ MAX_WAITERS = 16
 """Most copies that wait for one result; a robot sends one for each of its interfaces."""
 MAX_CACHED_BYTES = 64 * 1024 * 1024
 """Bytes of answers kept for late copies; beyond that the robot that holds the most loses its oldest."""
-MAX_REMEMBERED = 262_144
+MAX_REMEMBERED_IDS = 262_144
 """Ids remembered; one robot may fill half: 2000 requests a second for MIN_REMEMBER_S."""
 REMEMBER_LIFETIMES = 2.0
 """An id is remembered after the answer for this many lifetimes of its request ..."""
@@ -66,7 +66,7 @@ class _Key(NamedTuple):
 
 
 @dataclass(frozen=True, slots=True)
-class Waiter:
+class ReplyTo:
     """The destination of one copy's answer."""
 
     path: PathId
@@ -77,7 +77,7 @@ class Waiter:
 class Reply:
     """A message to the robot, wanted by `deadline` and useless after `expires`."""
 
-    waiter: Waiter
+    to: ReplyTo
     service: ServiceName
     message: ResponseMessage | RejectionMessage
     priority: Priority
@@ -101,7 +101,7 @@ class _Execution:
     """The longest lifetime that a copy asked for."""
     size: int
     """Bytes of the request's payload."""
-    waiters: list[Waiter] = field(default_factory=list)
+    waiters: list[ReplyTo] = field(default_factory=list)
     payload: bytes | None = None
     processing_s: float = 0.0
     refusal: tuple[RejectReason, str] | None = None
@@ -138,7 +138,7 @@ class ExecutionTable:
         self._running: dict[ExecutionId, _Execution] = {}
         self._running_shares = Shares(MAX_RUNNING)
         self._running_bytes = Shares(MAX_RUNNING_BYTES)
-        self._finished_shares = Shares(MAX_REMEMBERED)
+        self._finished_shares = Shares(MAX_REMEMBERED_IDS)
         self._cache = AnswerCache(MAX_CACHED_BYTES)
         self._timers: list[tuple[float, ExecutionId]] = []
         self._next_id = 0
@@ -171,7 +171,7 @@ class ExecutionTable:
 
         The local server may take as long as the robot waits, but at most `patience_s`.
         """
-        waiter = Waiter(path, message.copy)
+        reply_to = ReplyTo(path, message.copy)
         key = _Key(path.peer, message.request_id)
         running = self._by_request.get(key)
         execution = running or self._finished.get(key)
@@ -185,14 +185,14 @@ class ExecutionTable:
                 count[message.service, "cancelled"] += 1
                 return None
             if running is not None:
-                if len(execution.waiters) < MAX_WAITERS and waiter not in execution.waiters:
-                    execution.waiters.append(waiter)
+                if len(execution.waiters) < MAX_WAITERS and reply_to not in execution.waiters:
+                    execution.waiters.append(reply_to)
                     execution.expires = max(execution.expires, now + lifetime)
                     execution.lifetime_s = max(execution.lifetime_s, lifetime)
                 count[message.service, "coalesced"] += 1
                 return None
             count[message.service, "cached"] += 1
-            return self._reply(execution, waiter, now + lifetime)
+            return self._reply(execution, reply_to, now + lifetime)
         if lifetime <= 0:
             self._stats.dropped["request_expired"] += 1
             return None
@@ -202,7 +202,7 @@ class ExecutionTable:
             return None
         refused = self._refused.why(RefusedCopy(path.peer, message.request_id, message.copy), now)
         if refused is not None:
-            return self.refuse_unseen(waiter, message, *refused, now)
+            return self.refuse_unseen(reply_to, message, *refused, now)
         size = len(message.payload)
         if not (
             self._running_shares.fits(path.peer)
@@ -210,7 +210,7 @@ class ExecutionTable:
             and self._finished_shares.fits(path.peer)
         ):
             self._stats.dropped["executions_full"] += 1
-            return self.refuse_unseen(waiter, message, RejectReason.OVERLOADED, "too many requests", now)
+            return self.refuse_unseen(reply_to, message, RejectReason.OVERLOADED, "too many requests", now)
         execution = _Execution(
             ExecutionId(self._next_id),
             key,
@@ -221,7 +221,7 @@ class ExecutionTable:
             now + patience_s,
             lifetime,
             size,
-            [waiter],
+            [reply_to],
         )
         self._next_id += 1
         self._running_shares.take(path.peer)
@@ -249,7 +249,7 @@ class ExecutionTable:
             heapq.heapify(self._timers)
 
     def refuse_unseen(
-        self, waiter: Waiter, message: RequestMessage, reason: RejectReason, text: str, now: float
+        self, reply_to: ReplyTo, message: RequestMessage, reason: RejectReason, text: str, now: float
     ) -> Reply:
         """Refuse a copy: the request has not run here, and another copy of it may run later."""
         # These are not counted by name: a peer may write any name, and would create as many counters as it likes.
@@ -261,8 +261,8 @@ class ExecutionTable:
             self._stats.executions[message.service, "refused"] += 1
         rejection = RejectionMessage(message.request_id, message.copy, reason, text)
         expires = now + min(message.lifetime_left_s, MAX_LIFETIME_S)
-        self._remember_refused(waiter, message.request_id, reason, text, expires, now)
-        return Reply(waiter, message.service, rejection, message.priority, now + message.deadline_left_s, expires)
+        self._remember_refused(reply_to, message.request_id, reason, text, expires, now)
+        return Reply(reply_to, message.service, rejection, message.priority, now + message.deadline_left_s, expires)
 
     def complete(self, execution_id: ExecutionId, payload: bytes, processing_s: float, now: float) -> list[Reply]:
         """Take the local server's answer; return the replies to send."""
@@ -278,7 +278,7 @@ class ExecutionTable:
         execution.payload = payload
         execution.processing_s = processing_s
         self._keep(execution)
-        return [self._reply(execution, waiter, execution.expires) for waiter in execution.waiters]
+        return [self._reply(execution, reply_to, execution.expires) for reply_to in execution.waiters]
 
     def refuse(self, execution_id: ExecutionId, reason: RejectReason, text: str, now: float) -> list[Reply]:
         """Note that the local server did not answer; return the replies to send."""
@@ -288,18 +288,18 @@ class ExecutionTable:
         if execution.cancelled or not reason.certainly_not_run:
             self._remember(execution, now)
         else:
-            for waiter in execution.waiters:
-                self._remember_refused(waiter, execution.request_id, reason, text, execution.expires, now)
+            for reply_to in execution.waiters:
+                self._remember_refused(reply_to, execution.request_id, reason, text, execution.expires, now)
         if not execution.given_up:
             result = "cancelled" if reason is RejectReason.CANCELLED else "refused"
             self._stats.executions[execution.service, result] += 1
         execution.refusal = (reason, text)
-        return [self._reply(execution, waiter, execution.expires) for waiter in execution.waiters]
+        return [self._reply(execution, reply_to, execution.expires) for reply_to in execution.waiters]
 
     def _remember_refused(
-        self, waiter: Waiter, request_id: RequestId, reason: RejectReason, text: str, expires: float, now: float
+        self, reply_to: ReplyTo, request_id: RequestId, reason: RejectReason, text: str, expires: float, now: float
     ) -> None:
-        copy = RefusedCopy(waiter.path.peer, request_id, waiter.copy)
+        copy = RefusedCopy(reply_to.path.peer, request_id, reply_to.copy)
         self._refused.add(copy, reason, text, max(expires, now + MIN_REMEMBER_S), now)
 
     def cancel(self, robot: NodeName, request_id: RequestId, now: float) -> CancelExecution | None:
@@ -362,7 +362,7 @@ class ExecutionTable:
             self._remember(execution, now)
             execution.refusal = (RejectReason.SERVER_LOST, "the server did not answer in time")
             if awaited:
-                replies += [self._reply(execution, waiter, execution.expires) for waiter in execution.waiters]
+                replies += [self._reply(execution, reply_to, execution.expires) for reply_to in execution.waiters]
         return abandoned, replies
 
     def _finish(self, execution_id: ExecutionId) -> _Execution | None:
@@ -385,17 +385,17 @@ class ExecutionTable:
         forget_at = now + max(REMEMBER_LIFETIMES * execution.lifetime_s, MIN_REMEMBER_S)
         heapq.heappush(self._forget_at, (forget_at, execution.key))
 
-    def _reply(self, execution: _Execution, waiter: Waiter, expires: float) -> Reply:
+    def _reply(self, execution: _Execution, reply_to: ReplyTo, expires: float) -> Reply:
         request_id = execution.request_id
         if execution.payload is not None:
-            response = ResponseMessage(request_id, waiter.copy, execution.processing_s, execution.payload)
-            return Reply(waiter, execution.service, response, execution.priority, execution.deadline, expires)
+            response = ResponseMessage(request_id, reply_to.copy, execution.processing_s, execution.payload)
+            return Reply(reply_to, execution.service, response, execution.priority, execution.deadline, expires)
         reason, text = execution.refusal or (
             RejectReason.FORGOTTEN,
             "the request was answered before, and its answer is no longer kept",
         )
-        rejection = RejectionMessage(request_id, waiter.copy, reason, text)
-        return Reply(waiter, execution.service, rejection, execution.priority, execution.deadline, expires)
+        rejection = RejectionMessage(request_id, reply_to.copy, reason, text)
+        return Reply(reply_to, execution.service, rejection, execution.priority, execution.deadline, expires)
 
     def _keep(self, execution: _Execution) -> None:
         for robot, request_id in self._cache.add(*execution.key, len(execution.payload or b"")):

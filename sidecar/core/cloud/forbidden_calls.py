@@ -12,7 +12,7 @@ if TYPE_CHECKING:
 
 TELL_EVERY_S = 10.0
 """Least time between two notices about one robot."""
-MAX_ROBOTS = 1024
+MAX_FORBIDDEN_ROBOTS = 1024
 """Robots noted; beyond that the one noted first is forgotten, and its next call is reported at once."""
 
 
@@ -32,7 +32,7 @@ class ForbiddenCalls:
         """Count one more refused call; return the notice to give now, if any."""
         noted = self._robots.get(robot)
         if noted is None:
-            if len(self._robots) >= MAX_ROBOTS:
+            if len(self._robots) >= MAX_FORBIDDEN_ROBOTS:
                 del self._robots[next(iter(self._robots))]
             self._robots[robot] = _Noted(now)
             return CallsForbidden(robot, service, 1)

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from plr.protos.model.members import Candidate, Peer
     from plr.sidecar.core.crypto.session import OwnSession
 
-MAX_REMEMBERED = 8192
+MAX_ANNOUNCED_PEERS = 8192
 """Peers whose newest announcement is remembered; twice those of a view, so that the absent ones are forgotten."""
 
 
@@ -66,7 +66,7 @@ class Announced:
             return ()
         self._newest[told.name] = newest
         self._newest.move_to_end(told.name)
-        if len(self._newest) > MAX_REMEMBERED:
+        if len(self._newest) > MAX_ANNOUNCED_PEERS:
             self._newest.popitem(last=False)
         return newest.used
 

@@ -42,7 +42,7 @@ credentials that claim a restart has a budget of its own (`verification_budget.p
 
 
 @dataclass(frozen=True, slots=True)
-class Refusal:
+class RefusedPeer:
     """A peer of the view whose credential is bad."""
 
     peer: Peer
@@ -51,9 +51,9 @@ class Refusal:
     """Stays the same while the cause does: `why` may contain seconds that change."""
 
     @staticmethod
-    def of(peer: Peer, error: DecodeError) -> Refusal:
+    def of(peer: Peer, error: DecodeError) -> RefusedPeer:
         """Return the refusal of a peer whose judgement raised `error`."""
-        return Refusal(peer, str(error), error.reason if isinstance(error, CertificateError) else str(error))
+        return RefusedPeer(peer, str(error), error.reason if isinstance(error, CertificateError) else str(error))
 
 
 class Peers:
@@ -65,7 +65,7 @@ class Peers:
         self._known: dict[NodeName, Peer] = {}
         self._keys: dict[NodeName, PairKeys] = {}
         """Keys shared with each peer."""
-        self.refused: dict[NodeName, Refusal] = {}
+        self.refused: dict[NodeName, RefusedPeer] = {}
         """Refused peers of the view, so no more than `MAX_PEERS`."""
         self._announced = Announced(own, dropped)
         self._unlisted: set[NodeName] = set()
@@ -99,14 +99,14 @@ class Peers:
         gone = {removed.name for removed in peer_set.removed if removed.reason is not RemovalReason.LEASE_EXPIRED}
         known: dict[NodeName, Peer] = {}
         keys: dict[NodeName, PairKeys] = {}
-        refused: dict[NodeName, Refusal] = {}
+        refused: dict[NodeName, RefusedPeer] = {}
         for listed in peer_set.peers:
             peer = self._newer(listed)
             try:
                 keys[peer.name] = self._own.admit(peer)
                 known[peer.name] = self._at_announced(peer, listed)
             except DecodeError as error:
-                refused[peer.name] = Refusal.of(peer, error)
+                refused[peer.name] = RefusedPeer.of(peer, error)
         # Refused peers do not count: only the control plane vouches for their sessions.
         sessions = {peer.session for peer in known.values()}
         if len(sessions) != len(known):
@@ -223,7 +223,7 @@ class Peers:
             except DecodeError as error:
                 self._dropped["bad_credential"] += 1
                 if name not in self._unlisted:
-                    self.refused[name] = Refusal.of(peer, error)
+                    self.refused[name] = RefusedPeer.of(peer, error)
                 self._forget(name)
                 gone.append(name)
         return gone

@@ -16,6 +16,7 @@ from dataclasses import dataclass, field
 from itertools import islice
 from typing import TYPE_CHECKING, TypeVar
 
+from plr.sidecar.core.base.timers import NEVER
 from plr.sidecar.core.base.values import Priority
 from plr.sidecar.core.wire.messages import RevocationLists, RevocationsHeld, RevocationsWanted, encode_message
 
@@ -41,7 +42,7 @@ AWAIT_S = 120.0
 """Time for which a list is taken from a peer that we asked."""
 SEND_AGAIN_S = 20.0
 """Time before a peer is sent the same lists again, doubled each time: less than it waits before it asks again."""
-MAX_REMEMBERED = 4096
+MAX_EXCHANGE_PEERS = 4096
 """Peers whose holdings, questions and sendings are remembered, also after their session ends: a peer that restarts
 often must not be asked, or sent to, more often. As many as there can be peers; the one known longest is forgotten."""
 MAX_SENDING_BYTES = 4 * 1024 * 1024
@@ -54,7 +55,6 @@ LIFETIME_S = 120.0
 """Lifetime of a message on its way."""
 EXCHANGES = ("asked", "sent", "received", "taken")
 """The keys of `EngineStats.revocations`."""
-NEVER = float("inf")
 
 K = TypeVar("K")
 
@@ -271,7 +271,7 @@ class RevocationExchange:
 def _kept(table: dict[NodeName, K], peer: NodeName, new: Callable[[], K]) -> K:
     """Return the peer's entry, created in place of the oldest one if the table is full."""
     if peer not in table:
-        if len(table) >= MAX_REMEMBERED:
+        if len(table) >= MAX_EXCHANGE_PEERS:
             del table[next(iter(table))]
         table[peer] = new()
     return table[peer]

@@ -15,10 +15,10 @@ if TYPE_CHECKING:
     from plr.protos.model.ids import InterfaceId, NodeName, SessionId
     from plr.sidecar.core.path.keys import PathKeys
 
-MAX_PATHS_OF_A_PEER = 256
+MAX_REMEMBERED_PATHS_OF_PEER = 256
 """As many as one session can have to one of our interfaces, since an interface's number has 8 bits. So a share never
 forgets the current session."""
-MAX_PATHS = 16_384
+MAX_REMEMBERED_PATHS = 16_384
 """Beyond it, the peer with the most paths loses its oldest session's."""
 MAX_FORGOTTEN_PEERS = 65_536
 """Peers remembered as having a forgotten session."""
@@ -72,9 +72,9 @@ class LinkMemory:
         paths = self._paths.setdefault(peer, {})
         self._count += (session, remote) not in paths
         paths[session, remote] = keys
-        if len(paths) > MAX_PATHS_OF_A_PEER:
+        if len(paths) > MAX_REMEMBERED_PATHS_OF_PEER:
             self._evict(peer)
-        elif self._count > MAX_PATHS:
+        elif self._count > MAX_REMEMBERED_PATHS:
             self._evict(max(self._paths, key=lambda name: len(self._paths[name])))
 
     def take(self, peer: NodeName, session: SessionId, remote: InterfaceId) -> PathKeys | None:

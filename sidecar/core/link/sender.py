@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from plr.protos.trust.credential import SessionCredential
     from plr.sidecar.core.message.symbols import MessageSymbols
     from plr.sidecar.core.path.path import Path
-    from plr.sidecar.core.path.send_queue import Run
+    from plr.sidecar.core.path.send_queue import SymbolRun
     from plr.sidecar.core.seam.stats import LinkStats
 
 BURST_DATAGRAMS = 64
@@ -190,7 +190,7 @@ class DatagramBuilder:
             self._stats.dropped["expired"] += queue.expired - expired_before
         return complete
 
-    def _add_run(self, path: Path, remote: Address, run: Run, burst: Burst, now: float) -> int:
+    def _add_run(self, path: Path, remote: Address, run: SymbolRun, burst: Burst, now: float) -> int:
         """Add a run's datagrams and return their bytes. Waiting control frames go with it or before it."""
         end, sources = run.first + run.symbols, run.message.count
         path.waits_for_answer(now)
@@ -243,7 +243,7 @@ class DatagramBuilder:
         return end
 
     def _add_with_control(
-        self, path: Path, remote: Address, control: list[bytes], run: Run, burst: Burst, now: float
+        self, path: Path, remote: Address, control: list[bytes], run: SymbolRun, burst: Burst, now: float
     ) -> int:
         """Build one datagram of control frames and a symbol, such as a small answer and what its request is owed."""
         message, index = run.message, run.first

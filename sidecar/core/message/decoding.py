@@ -20,10 +20,10 @@ if TYPE_CHECKING:
     from plr.sidecar.core.base.values import PathId
     from plr.sidecar.core.message.partial import Partial
 
-MAX_BYTES = 128 * 1024 * 1024
+MAX_DECODING_BYTES = 128 * 1024 * 1024
 """Bytes of the messages in line, repair symbols included. One peer may hold half: two of the largest that came as
 repair symbols alone."""
-MAX_MESSAGES = 16_384
+MAX_DECODING_MESSAGES = 16_384
 """Messages in line; one peer may have half of them, as many as requests may be in flight to it."""
 
 
@@ -50,8 +50,8 @@ class DecodingLine:
     __slots__ = ("_bytes", "_messages", "_of")
 
     def __init__(self) -> None:
-        self._bytes = Shares(MAX_BYTES)
-        self._messages = Shares(MAX_MESSAGES)
+        self._bytes = Shares(MAX_DECODING_BYTES)
+        self._messages = Shares(MAX_DECODING_MESSAGES)
         self._of: OrderedDict[NodeName, deque[Decoding]] = OrderedDict()
         """Each peer's messages, oldest first; the peers by their last turn, longest ago first."""
 

@@ -24,7 +24,7 @@ MAX_PEER_BYTES = 64 * 1024 * 1024
 unless what it called off is still held here (ABANDON is sent once)."""
 MAX_PEER_MESSAGES = 8192
 """Unfinished messages of one peer: as many as requests may be in flight to it."""
-MAX_AGE_S = 30.0
+MAX_SILENCE_S = 30.0
 """An unfinished message that gets no symbol for this long is dropped."""
 OVER_REMEMBERED = 8192
 """Finished, forgotten or abandoned message numbers kept per peer, so that late symbols are recognised."""
@@ -197,6 +197,6 @@ class Reassembler:
         self._over[number] = Fate.FORGOTTEN
 
     def expire(self, now: float) -> None:
-        """Drop messages that got no symbol for MAX_AGE_S."""
-        while self._partials and next(iter(self._partials.values())).touched_at + MAX_AGE_S <= now:
+        """Drop messages that got no symbol for MAX_SILENCE_S."""
+        while self._partials and next(iter(self._partials.values())).touched_at + MAX_SILENCE_S <= now:
             self._forget_oldest("reassembly_expired")

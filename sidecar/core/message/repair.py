@@ -82,7 +82,7 @@ MAX_RATIO = 0.5
 """Most repair symbols per source symbol when the measured loss decides: beyond it, sending again is cheaper."""
 WORTH_A_COPY = 0.005
 """Datagrams with at least this probability of a loss, which costs a round trip, travel twice: see `worth_a_copy`."""
-MAX_COPIES = 16
+MAX_DOUBLED_SYMBOLS = 16
 """Most symbols lost at once that travel twice: more of them are an outage or a full queue."""
 _STEPS_PER_OCTAVE = 4
 """Losses are rounded up to this many steps per octave, so that results can be cached."""
@@ -111,7 +111,7 @@ def worth_a_copy(datagrams: int, loss: Loss) -> bool:
     They get copies instead of repair symbols, since they are few, need no coding on either side, and can take another
     path.
     """
-    return datagrams <= MAX_COPIES and 1.0 - (1.0 - loss.share) ** datagrams >= WORTH_A_COPY
+    return datagrams <= MAX_DOUBLED_SYMBOLS and 1.0 - (1.0 - loss.share) ** datagrams >= WORTH_A_COPY
 
 
 @lru_cache(maxsize=4096)

@@ -49,7 +49,7 @@ MAX_PROBES_OUT = 1024
 addresses each."""
 
 
-class Probe(NamedTuple):
+class AnsweredProbe(NamedTuple):
     """A probe that was answered."""
 
     sent_at: float
@@ -95,9 +95,9 @@ class Probing:
         self._asked_at = now
         self._asked_every = MAX_IDLE_PROBE_S
         """Interval at which the peer asks."""
-        self._out: dict[int, Probe] = {}
+        self._out: dict[int, AnsweredProbe] = {}
         """Scheduled probes, the oldest first."""
-        self._back: dict[int, Probe] = {}
+        self._back: dict[int, AnsweredProbe] = {}
         """Probes sent in answer to introductions. They are kept apart, since each repeated introduction makes us send
         one."""
 
@@ -126,13 +126,13 @@ class Probing:
     def ask(self, now: float, to: Address | None, *, sealed: bool) -> int:
         """Return the id of a scheduled probe that leaves now to this address."""
         self.last_at = now
-        return self._note(self._out, Probe(now, to, sealed))
+        return self._note(self._out, AnsweredProbe(now, to, sealed))
 
     def ask_back(self, now: float, to: Address) -> int:
         """Return the id of a sealed probe that leaves now with the answer to an introduction, to its source."""
-        return self._note(self._back, Probe(now, to, sealed=True))
+        return self._note(self._back, AnsweredProbe(now, to, sealed=True))
 
-    def _note(self, out: dict[int, Probe], probe: Probe) -> int:
+    def _note(self, out: dict[int, AnsweredProbe], probe: AnsweredProbe) -> int:
         while out:
             oldest = next(iter(out))
             if len(out) < MAX_PROBES_OUT and out[oldest].sent_at > probe.sent_at - LONGEST_ANSWER_S:
@@ -142,7 +142,7 @@ class Probing:
         out[probe_id] = probe
         return probe_id
 
-    def answered(self, probe_id: int, now: float) -> Probe | None:
+    def answered(self, probe_id: int, now: float) -> AnsweredProbe | None:
         """Return the probe that this answers, once and not too late; None if it answers nothing we asked."""
         probe = self._out.pop(probe_id, None) or self._back.pop(probe_id, None)
         return probe if probe is not None and probe.sent_at > now - LONGEST_ANSWER_S else None

@@ -28,7 +28,7 @@ PACKET_THRESHOLD = 3
 """A datagram is lost when one sent this many later is acknowledged (RFC 9002 section 6.1.1)."""
 PERSISTS = 16
 """Losses that stayed losses after which learned reordering is forgotten (RACK's reo_wnd_persist)."""
-MAX_REMEMBERED = 64
+MAX_LOST_RUNS = 64
 """Lost runs whose late acknowledgement is still noticed; beyond that the oldest are forgotten."""
 MEMORY_FACTOR = 4.0
 """A datagram acknowledged after this many probe timeouts was not overtaken: the path was slow, or away."""
@@ -59,7 +59,7 @@ class Reordering:
     __slots__ = ("_extra_s", "_lost", "_persists", "missed", "spurious")
 
     def __init__(self) -> None:
-        self._lost: deque[_Lost] = deque(maxlen=MAX_REMEMBERED)
+        self._lost: deque[_Lost] = deque(maxlen=MAX_LOST_RUNS)
         self._extra_s = 0.0
         self._persists = 0
         self.spurious = 0
@@ -126,7 +126,7 @@ class Reordering:
             if why is _Why.THRESHOLD and run.at >= overtaken_since:
                 self._persists = PERSISTS
                 self._extra_s = max(self._extra_s, now - run.at - rtt.loss_delay())
-        self._lost = deque(kept, MAX_REMEMBERED)
+        self._lost = deque(kept, MAX_LOST_RUNS)
         return arrived
 
     def overtaken(self, largest_acked: int) -> None:

@@ -135,7 +135,7 @@ MAX_RUN_BYTES = 65_000
 """Bytes in a run: the largest UDP payload, less a margin for other frames."""
 
 
-class Run(NamedTuple):
+class SymbolRun(NamedTuple):
     """Consecutive symbols of one message, to be sent in sequence."""
 
     message: MessageSymbols
@@ -227,7 +227,7 @@ class SendQueue:
         self._entries = {number: entry for number, entry in self._entries.items() if not entry.message.over}
         self._purge_at = max(PURGE_AT, 2 * len(self._entries))
 
-    def take(self, now: float, budget: int, pace: float = 0.0, round_trip_s: float = 0.0) -> Run | None:
+    def take(self, now: float, budget: int, pace: float = 0.0, round_trip_s: float = 0.0) -> SymbolRun | None:
         """Remove and return what leaves next: at most about `budget` bytes, but at least one symbol.
 
         Messages that are over or expired are dropped on the way. `pace` (bytes a second, 0 when unknown) and
@@ -259,7 +259,9 @@ class SendQueue:
             elif not higher:
                 each.passed_over = min(each.passed_over + symbols, SHARE * MAX_RUN)
 
-    def _take(self, chosen: _Class, now: float, budget: int, most: int, pace: float, round_trip_s: float) -> Run | None:
+    def _take(
+        self, chosen: _Class, now: float, budget: int, most: int, pace: float, round_trip_s: float
+    ) -> SymbolRun | None:
         while (heap := self._head(chosen, now, pace, round_trip_s)) is not None:
             entry = heap[0][2]
             message = entry.message
@@ -271,7 +273,7 @@ class SendQueue:
                     self._drop(heap)
                 elif heap is not chosen.fresh and heap is not chosen.covered:
                     heapq.heapreplace(heap, (BEGUN, heap[0][1], entry))
-                return Run(message, *run)
+                return SymbolRun(message, *run)
             self._drop(heap)
         return None
 

@@ -25,7 +25,7 @@ from plr.sidecar.core.base.values import PathId, PathState, RejectReason, Reques
 from plr.sidecar.core.robot.dispatch.attention import Attention
 from plr.sidecar.core.robot.dispatch.backlog import NoRoom
 from plr.sidecar.core.robot.dispatch.cancelling import SMALL_ANSWER_BYTES, CallingOff
-from plr.sidecar.core.robot.dispatch.dispatcher import MAX_COPIES, Dispatching
+from plr.sidecar.core.robot.dispatch.dispatcher import MAX_COPIES_OF_REQUEST, Dispatching
 from plr.sidecar.core.robot.measure.outcomes import measure_outcomes
 from plr.sidecar.core.robot.request.request import Answer, Copy, CopyState, Request
 from plr.sidecar.core.seam.application import DeadlineMissed, RequestFailed, ResponseArrived, Unreachable
@@ -51,9 +51,9 @@ MAX_IN_FLIGHT = 8192
 RETRY_S = 0.05
 """A request that was refused for the moment is asked again after twice this, doubled with each copy, ..."""
 MAX_RETRY_S = 2.0
-"""... and after no more than this for the first MAX_COPIES. Then the time doubles again, so that a server that takes
-minutes to start is still asked before the request's lifetime ends, and few bytes travel in vain."""
-MAX_HELD_BYTES = 256 * 1024 * 1024
+"""... and after no more than this for the first MAX_COPIES_OF_REQUEST. Then the time doubles again, so that a server
+that takes minutes to start is still asked before the request's lifetime ends, and few bytes travel in vain."""
+MAX_REQUEST_TABLE_BYTES = 256 * 1024 * 1024
 """Most payload bytes held. A payload is held until its request's last copy has ended, also while the request waits for
 a path or for room."""
 TIMER_SLACK = 1024
@@ -110,7 +110,7 @@ class RequestTable:
             return f"the service's name or type is longer than {MAX_NAME_BYTES} bytes"
         if self.unanswered >= MAX_IN_FLIGHT:
             return f"{MAX_IN_FLIGHT} requests are in flight already"
-        if self._held_bytes + size > MAX_HELD_BYTES:
+        if self._held_bytes + size > MAX_REQUEST_TABLE_BYTES:
             return f"the requests in flight have {self._held_bytes} bytes already"
         if request_id in self._requests:
             return "a request with this identity is in flight already"
@@ -125,13 +125,13 @@ class RequestTable:
         self.unanswered += more
         self._parts.stats.in_flight = self.unanswered
 
-    def answered_here(self, request_id: RequestId, now: float) -> None:
+    def answered_locally(self, request_id: RequestId, now: float) -> None:
         """Note that the application got its answer on the robot. The request ends at its deadline at the latest."""
         request = self._requests.get(request_id)
         if request is not None and not request.done:
-            request.answered_here = True
+            request.answered_locally = True
             if now >= request.deadline_at:
-                self._end_answered_here(request, now)
+                self._end_answered_locally(request, now)
 
     def _start(self, request: Request, servers: list[NodeName], now: float) -> bool:
         """Send a request without copies to some of these servers; return whether it waits for room now."""
@@ -331,7 +331,7 @@ class RequestTable:
         request.refusal = reason
         self._requests.strand(request)
         copies = len(request.copies)
-        retry_s = min(RETRY_S * 2**copies, MAX_RETRY_S) * 2 ** max(0, copies - MAX_COPIES)
+        retry_s = min(RETRY_S * 2**copies, MAX_RETRY_S) * 2 ** max(0, copies - MAX_COPIES_OF_REQUEST)
         request.retry_at = now + retry_s
         self._look_at(request, request.retry_at)
         self._tell_unreachable(request)
@@ -498,8 +498,8 @@ class RequestTable:
                 self._settle(request, now)
             elif request.judged:
                 pass  # about to be answered, in time, or rescued
-            elif request.answered_here:
-                self._end_answered_here(request, now)
+            elif request.answered_locally:
+                self._end_answered_locally(request, now)
             elif not request.missed:
                 self._miss(request)
                 if request.rule.idempotent and request not in self._no_room:  # it does not overtake those that wait
@@ -510,7 +510,7 @@ class RequestTable:
         copies = tuple(Assignment(copy.path.interface, copy.path.peer) for copy in request.copies)
         self._parts.emit(DeadlineMissed(request.id, request.service, request.rule.deadline_s, copies))
 
-    def _end_answered_here(self, request: Request, now: float) -> None:
+    def _end_answered_locally(self, request: Request, now: float) -> None:
         """End a request that the network has not answered by the deadline: it missed and need not answer any more."""
         if not request.observed:
             self._calling_off.call_off(request, request.pending(), now)

@@ -56,7 +56,7 @@ class ResponseArrived:
 class DeadlineMissed:
     """A request's deadline passed without a response; the request goes on until its lifetime ends.
 
-    Not sent for a request that the application already has an answer to (`answered_here`).
+    Not sent for a request that the application already has an answer to (`answered_locally`).
     """
 
     request_id: RequestId
@@ -77,7 +77,7 @@ class Unreachable:
 class RequestFailed:
     """No response will come. `outcome` is a label of plr_requests_total: failed, rejected or late_dropped.
 
-    For a request with `answered_here` it is deadline_missed.
+    For a request with `answered_locally` it is deadline_missed.
     """
 
     request_id: RequestId

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from plr.sidecar.core.base.values import PathId
     from plr.sidecar.core.message.outbound import OutboundMessage
 
-MAX_MESSAGES = 16_384
+MAX_UNDELIVERED_MESSAGES = 16_384
 """All undelivered messages; one peer may have half of them, as many as requests may be in flight."""
 SMALL_BYTES = 256 * 1024
 """The longest message that counts as small: a camera's image does."""
@@ -52,7 +52,7 @@ class Room:
     __slots__ = ("_held", "_messages", "_over", "held_bytes")
 
     def __init__(self) -> None:
-        self._messages = Shares(MAX_MESSAGES)
+        self._messages = Shares(MAX_UNDELIVERED_MESSAGES)
         self._held: dict[tuple[NodeName, Lane], int] = {}
         self._over: dict[PathId, int] = {}
         self.held_bytes = 0

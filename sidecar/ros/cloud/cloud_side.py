@@ -13,7 +13,7 @@ from plr.sidecar.core.rules.service_rule import Rules
 from plr.sidecar.core.seam.application import AbandonExecution, CallsForbidden, CancelExecution, ExecuteRequest
 from plr.sidecar.ros.cloud.roll_call import POLL_S, RollCall
 from plr.sidecar.ros.cloud.server_processes import ServerProcesses
-from plr.sidecar.ros.cloud.service_runner import Execution, ServiceRunner
+from plr.sidecar.ros.cloud.service_runner import PendingCall, ServiceRunner
 from plr.sidecar.ros.errors import RosBridgeError
 from plr.sidecar.ros.graph import graph
 from plr.sidecar.ros.graph.node_names import NodeNames
@@ -28,10 +28,10 @@ if TYPE_CHECKING:
     from plr.sidecar.core.seam.application import ApplicationEvent
     from plr.sidecar.ports import DataPlane
     from plr.sidecar.ros.log_limit import LimitedLog
-    from plr.sidecar.ros.ros_loop import RosLoop
+    from plr.sidecar.ros.ros_loop import RosLoop, Waited
     from plr.sidecar.ros.stats import BridgeStats
 
-MAX_EXECUTIONS = 4096
+MAX_PENDING_CALLS = 4096
 """Requests at local servers or waiting for them; one robot may have half. Further ones are refused as OVERLOADED, so
 that another server runs them."""
 MAX_CARRIED_SERVICES = 512
@@ -67,8 +67,8 @@ class CloudSide:
         self._stats = stats
         self._limited = limited_log
         self._runners: dict[ServiceName, ServiceRunner] = {}
-        self._executions: dict[ExecutionId, tuple[ServiceRunner, Execution]] = {}
-        self._shares = Shares(MAX_EXECUTIONS)
+        self._calls: dict[ExecutionId, tuple[ServiceRunner, PendingCall]] = {}
+        self._shares = Shares(MAX_PENDING_CALLS)
         self._offers: tuple[ServiceOffer, ...] = ()
         self._missing_types: dict[ServiceName, str] = {}
         self._types_retried_at = 0.0
@@ -82,8 +82,8 @@ class CloudSide:
         self._in_doubt: frozenset[ServiceRunner] = frozenset()
         """Runners at work whose server has been silent for so long that it must be heard to count as alive."""
         self._check_at = 0.0
-        self.look_is_due = False
-        """Whether a look at the graph is due although it has not changed."""
+        self.scan_is_due = False
+        """Whether a scan of the graph is due although it has not changed."""
         self._paced: set[ServiceRunner] = set()
         """Runners with requests that wait for room at their server."""
 
@@ -117,7 +117,7 @@ class CloudSide:
             self.refuse(event, RejectReason.WRONG_TYPE, f"the type here is {runner.type.name}", now)
             return
         if not self._shares.fits(event.robot):
-            why = f"{len(self._executions)} requests are running, {self._shares.held(event.robot)} of this robot"
+            why = f"{len(self._calls)} requests are running, {self._shares.held(event.robot)} of this robot"
             self.refuse(event, RejectReason.OVERLOADED, why, now)
             return
         try:
@@ -125,13 +125,15 @@ class CloudSide:
         except RosBridgeError as error:
             self.refuse(event, RejectReason.BAD_PAYLOAD, str(error), now)
             return
-        execution = Execution(
+        call = PendingCall(
             event.execution, event.robot, request, now, event.priority, now + event.deadline_s, now + event.expires_s
         )
-        self._executions[event.execution] = (runner, execution)
+        self._calls[event.execution] = (runner, call)
         self._shares.take(event.robot)
-        self._stats.pending = len(self._executions)
-        if not runner.add(execution, now):
+        self._stats.pending = len(self._calls)
+        runner.add(call, now)
+        self._release(runner, now)
+        if runner.window.holds(call):
             self._stats.requests_paced += 1
             self._paced.add(runner)
         self._at_work.add(runner)
@@ -157,58 +159,67 @@ class CloudSide:
         if known is None:
             self._stats.dropped["abandon_without_execution"] += 1
             return
-        runner, execution = known
-        runner.abandon(execution)
+        runner, call = known
+        runner.abandon(call)
         self._paced.add(runner)  # there may be room now for waiting requests
         self._stats.abandoned[runner.name] += 1
-        if event.awaited and execution.number is None:
+        if event.awaited and call.number is None:
             why = "its time here was over before the server had room for it"
-            self._data_plane.refuse(execution.id, RejectReason.OVERLOADED, why)
+            self._data_plane.refuse(call.id, RejectReason.OVERLOADED, why)
         elif event.awaited:
-            self._data_plane.refuse(execution.id, RejectReason.SERVER_LOST, "the server did not answer in time")
+            self._data_plane.refuse(call.id, RejectReason.SERVER_LOST, "the server did not answer in time")
 
-    def _forget(self, execution: ExecutionId) -> tuple[ServiceRunner, Execution] | None:
-        known = self._executions.pop(execution, None)
+    def _forget(self, execution: ExecutionId) -> tuple[ServiceRunner, PendingCall] | None:
+        known = self._calls.pop(execution, None)
         if known is not None:
             self._shares.give_back(known[1].robot)
-            self._stats.pending = len(self._executions)
+            self._stats.pending = len(self._calls)
         return known
 
     def _cancel(self, event: CancelExecution) -> None:
         """Drop a request that has not reached its server yet: the robot has its answer."""
-        known = self._executions.get(event.execution)
+        known = self._calls.get(event.execution)
         if known is None:
             return  # it was answered a moment ago
-        runner, execution = known
-        if execution.number is None:
-            runner.abandon(execution)
-            self._refuse_executions([execution], runner.name, RejectReason.CANCELLED, "called off")
+        runner, call = known
+        if call.number is None:
+            runner.abandon(call)
+            self._refuse_calls([call], runner.name, RejectReason.CANCELLED, "called off")
 
     # -- what the local servers answer -----------------------------------------------------------------------------
 
-    def _answered(self, runner: ServiceRunner, execution: Execution, payload: bytes, now: float) -> None:
-        self._forget(execution.id)
+    def take(self, entity: Waited, now: float) -> None:
+        """Pass on the answers that have arrived from a server, and send what it has room for now."""
+        if not isinstance(entity, ServiceRunner):
+            return
+        for call, payload in entity.take(now):
+            if call is None:
+                # Its request was abandoned, or two nodes serve one name and this is the second answer.
+                self._stats.dropped["answer_without_execution"] += 1
+            else:
+                self._answered(entity, call, payload, now)
+        self._release(entity, now)
+
+    def _answered(self, runner: ServiceRunner, call: PendingCall, payload: bytes, now: float) -> None:
+        self._forget(call.id)
         self._stats.answers_taken[runner.name] += 1
         if (server := runner.server.only) is not None and self._roll_call.answered(server, now):
-            self.look_is_due = True
-        self._data_plane.complete(execution.id, payload, now - execution.arrived_at)
+            self.scan_is_due = True
+        self._data_plane.complete(call.id, payload, now - call.arrived_at)
 
-    def _unsent(self, runner: ServiceRunner, execution: Execution, why: str) -> None:
-        self._refuse_executions([execution], runner.name, RejectReason.OVERLOADED, why)
-
-    def _stray(self, _runner: ServiceRunner) -> None:
-        """Count an answer to an abandoned request, or a second answer because two nodes serve one name."""
-        self._stats.dropped["answer_without_execution"] += 1
+    def _release(self, runner: ServiceRunner, now: float) -> None:
+        for call, why in runner.release(now):
+            self._refuse_calls([call], runner.name, RejectReason.OVERLOADED, why)
 
     # -- what the graph shows ------------------------------------------------------------------------------------
 
     def settling(self) -> bool:
-        """Return whether another look at the graph should follow soon, even if it does not change."""
+        """Return whether another scan of the graph should follow soon, even if it does not change."""
         return any(not runner.server.ready for runner in self._runners.values())
 
-    def look(self) -> Iterator[None]:
+    def scan(self) -> Iterator[None]:
         """Compare the graph with the clients, in small steps; tell the data plane what is now offered."""
-        self._names.begin_look()
+        self._names.begin_scan()
         served = yield from graph.scan(self._loop.node, self._names.name_of, self._is_in_rules, time.monotonic())
         self._stats.scans += 1
         now = time.monotonic()
@@ -225,12 +236,12 @@ class CloudSide:
             yield
             runner = self._runners.get(name)
             if runner is not None:
-                self._look_at(runner, time.monotonic())
+                self._scan_servers(runner, time.monotonic())
                 self._notice_several_servers(runner, served[name].applications().get(type_name, frozenset()))
             elif retry_types or name not in self._missing_types:
                 self._open_runner(name, type_name)
         yield
-        self._names.end_look()
+        self._names.end_scan()
         self._processes.forget_the_gone()
         self._roll_call.keep(graph.participants(self._loop.node))
         self._publish_state()
@@ -282,11 +293,11 @@ class CloudSide:
             log.warning("service %s is served here with several types, %s: robots get %s", name, served, chosen)
         return chosen
 
-    def _look_at(self, runner: ServiceRunner, now: float) -> None:
-        """Look at a runner's servers; give up its executions if its server is gone, even if another replaced it."""
-        if runner.server.look(self._is_dead, now):
+    def _scan_servers(self, runner: ServiceRunner, now: float) -> None:
+        """Scan a runner's servers; give up its calls if its server is gone, even if another replaced it."""
+        if runner.server.scan(self._is_dead, now):
             log.warning("service %s: its server is gone or was replaced by another", runner.name)
-            self._give_up_executions(runner, "the server was replaced")
+            self._give_up_calls(runner, "the server was replaced")
         if runner.server.lost:
             self._at_work.add(runner)  # until it is heard again, or gone
         for endpoint in runner.server.endpoints:
@@ -317,9 +328,6 @@ class CloudSide:
                 self._loop.node,
                 name,
                 load_service_type(type_name),
-                self._answered,
-                self._stray,
-                self._unsent,
                 self._is_alive_since,
                 self._names.name_of,
             )
@@ -337,24 +345,22 @@ class CloudSide:
     def _close_runner(self, name: ServiceName, why: str) -> None:
         runner = self._runners.pop(name)
         self._loop.set_clients(tuple(self._runners.values()))
-        self._give_up_executions(runner, why)
+        self._give_up_calls(runner, why)
         self._at_work.discard(runner)
         runner.close()
         log.info("service %s is no longer offered to robots: %s", name, why)
 
-    def _give_up_executions(self, runner: ServiceRunner, why: str) -> None:
+    def _give_up_calls(self, runner: ServiceRunner, why: str) -> None:
         sent, unsent = runner.take_back()
         self._paced.discard(runner)
-        self._refuse_executions(sent, runner.name, RejectReason.SERVER_LOST, why)
-        self._refuse_executions(unsent, runner.name, RejectReason.NOT_OFFERED, why)
+        self._refuse_calls(sent, runner.name, RejectReason.SERVER_LOST, why)
+        self._refuse_calls(unsent, runner.name, RejectReason.NOT_OFFERED, why)
 
-    def _refuse_executions(
-        self, executions: list[Execution], service: ServiceName, reason: RejectReason, detail: str
-    ) -> None:
-        for execution in executions:
-            self._forget(execution.id)
+    def _refuse_calls(self, calls: list[PendingCall], service: ServiceName, reason: RejectReason, detail: str) -> None:
+        for call in calls:
+            self._forget(call.id)
             self._stats.refused[service, reason.name.lower()] += 1
-            self._data_plane.refuse(execution.id, reason, detail)
+            self._data_plane.refuse(call.id, reason, detail)
 
     def _publish_state(self) -> None:
         ready = {name: runner for name, runner in self._runners.items() if runner.server.ready}
@@ -411,9 +417,9 @@ class CloudSide:
         if hit:
             log.warning("the process of a server ended: %s", " ".join(sorted(runner.name for runner in hit)))
         for runner in hit:
-            self._give_up_executions(runner, "the server's process ended")
+            self._give_up_calls(runner, "the server's process ended")
         self._publish_state()
-        self.look_is_due = True  # for those of another type
+        self.scan_is_due = True  # for those of another type
 
     def _notice_silence(self) -> None:
         """Refuse what waits for servers that show no sign of life; what they already have may still be answered."""
@@ -424,9 +430,9 @@ class CloudSide:
         for runner in hit:
             self._at_work.add(runner)
             self._paced.discard(runner)
-            self._refuse_executions(runner.take_back_unsent(), runner.name, RejectReason.NOT_OFFERED, why)
+            self._refuse_calls(runner.take_back_unsent(), runner.name, RejectReason.NOT_OFFERED, why)
         self._publish_state()
-        self.look_is_due = True  # for those that are heard again
+        self.scan_is_due = True  # for those that are heard again
 
     def _endpoints_to_ask(self, now: float) -> list[bytes]:
         """Return the ids of servers whose silence may mean that they are dead, and of those found silent before."""
@@ -475,13 +481,13 @@ class CloudSide:
             self._check_at = now + (POLL_S if self._roll_call.under_way else CHECK_EVERY_S)
             self._paced |= self._at_work  # a server that was heard may get more than it answers
         if self._names.turn(now):
-            self.look_is_due = True
+            self.scan_is_due = True
         for runner in tuple(self._paced):
             due = runner.window.next_due()
             if due is None:
                 self._paced.discard(runner)
             elif due <= now:
-                runner.release(now)
+                self._release(runner, now)
 
     def close(self) -> None:
         """Withdraw all offers and refuse what is running."""
@@ -495,7 +501,7 @@ class CloudSide:
             runner = self._runners.pop(name)
             sent, unsent = runner.take_back()
             # Those at the server may have run; another server may run the rest.
-            self._refuse_executions(sent, name, RejectReason.SERVER_LOST, "the sidecar is shutting down")
-            self._refuse_executions(unsent, name, RejectReason.DRAINING, "the sidecar is shutting down")
+            self._refuse_calls(sent, name, RejectReason.SERVER_LOST, "the sidecar is shutting down")
+            self._refuse_calls(unsent, name, RejectReason.DRAINING, "the sidecar is shutting down")
             runner.close()
         self._loop.set_clients(())

@@ -47,7 +47,7 @@ class LocalServer:
         """Endpoints that may still owe answers."""
         self._usable_at: float | None = None
         self._matched = False
-        self._looked = False
+        self._scanned = False
         self.ready = False
         """Whether requests may be sent; otherwise rmw would silently drop them, or no server is there."""
 
@@ -80,15 +80,15 @@ class LocalServer:
     def is_usable(self, now: float) -> bool:
         """Return whether a server in the graph lives and knows our client by now."""
         if not self.endpoints:
-            return self._looked
+            return self._scanned
         return self._usable_at is not None and now >= self._usable_at
 
-    def look(self, is_dead: Callable[[bytes], bool], now: float) -> bool:
-        """Look at the graph; return whether all servers of the last look are gone, and so will answer nothing."""
+    def scan(self, is_dead: Callable[[bytes], bool], now: float) -> bool:
+        """Scan the graph; return whether all servers of the last scan are gone, and so will answer nothing."""
         # A node that serves the name with another type gets none of our requests, and answers nothing.
         known = graph.server_endpoints(self._node, self.name, self._name_of, now).get(self.type.name, {})
         self.endpoints = frozenset(known)
-        self._looked = True
+        self._scanned = True
         alive = frozenset(endpoint for endpoint, is_known in known.items() if is_known and not is_dead(endpoint))
         if not alive & self._alive:
             self._usable_at = now + SETTLES_S if alive else None

@@ -18,7 +18,7 @@ from plr.sidecar.ros.rcl import LatchedTopic, MessageType
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-MAX_HEARD = 1024
+MAX_HEARD_PROCESSES = 1024
 """Participants that one call can hear; the depth of the topic."""
 TAKEN_AT_ONCE = 64
 BYTES_AT_ONCE = 1 << 16
@@ -51,7 +51,7 @@ class DiscoveryTopic:
                 # Every DDS rmw needs this package; other rmw implementations work without it.
                 module = importlib.import_module("rmw_dds_common.msg")
                 self._type = MessageType(module.ParticipantEntitiesInfo)
-            self._topic = LatchedTopic(self._node.handle.pointer, PARTICIPANTS_TOPIC, self._type, MAX_HEARD)
+            self._topic = LatchedTopic(self._node.handle.pointer, PARTICIPANTS_TOPIC, self._type, MAX_HEARD_PROCESSES)
         except (ImportError, AttributeError, RosBridgeError) as error:
             self.usable = False
             log.error(

@@ -1,7 +1,7 @@
 """Finds out who serves what in the local ROS graph.
 
-rmw reports that the graph has changed, but not what; `looks.py` decides when to look. An endpoint whose node rmw does
-not know may have a name all the same (`unknown_nodes.py`); without one it does not count as an application's server.
+rmw reports that the graph has changed, but not what; `scans.py` decides when to scan it. An endpoint whose node rmw
+does not know may have a name all the same (`unknown_nodes.py`); without one it is no server of an application.
 """
 
 from __future__ import annotations

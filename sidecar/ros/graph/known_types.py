@@ -17,13 +17,13 @@ if TYPE_CHECKING:
     from plr.protos.model.members import Peer
     from plr.sidecar.core.rules.service_rule import ServiceRule
 
-MAX_LINES = 10
+MAX_MISSING_TYPE_LINES = 10
 
 
 def missing_types(peers: Iterable[Peer], rules: Iterable[ServiceRule]) -> list[str]:
     """Return a line for each service that `peers` offer and `rules` carry, but whose type is missing here.
 
-    There are at most MAX_LINES, and one that counts the rest.
+    There are at most MAX_MISSING_TYPE_LINES, and one that counts the rest.
     """
     carried = Rules(rules)
     servers = {
@@ -39,8 +39,8 @@ def missing_types(peers: Iterable[Peer], rules: Iterable[ServiceRule]) -> list[s
             problems[kind] = _problem(kind)
         if (problem := problems[kind]) is not None:
             lines.append(f"{name}, which {server} offered last, cannot be carried: {problem}")
-    left_out = len(lines) - MAX_LINES
-    return [*lines[:MAX_LINES], f"and {left_out} more"] if left_out > 0 else lines
+    left_out = len(lines) - MAX_MISSING_TYPE_LINES
+    return [*lines[:MAX_MISSING_TYPE_LINES], f"and {left_out} more"] if left_out > 0 else lines
 
 
 def _problem(kind: str) -> str | None:

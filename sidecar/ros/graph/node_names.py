@@ -37,17 +37,17 @@ class NodeNames:
         self._hears_at = 0.0
         self._ends_at = 0.0
 
-    def begin_look(self) -> None:
-        """Begin another look at the graph."""
-        self._unknown.begin_look()
+    def begin_scan(self) -> None:
+        """Begin another scan of the graph."""
+        self._unknown.begin_scan()
 
     def name_of(self, endpoint: bytes, now: float) -> str | None:
         """Return the full name of the node of an endpoint that rmw has no name for; if None, it is asked for soon."""
         return self._unknown.name_of(endpoint, now)
 
-    def end_look(self) -> None:
-        """Forget the endpoints that the look did not see."""
-        if dropped := self._unknown.end_look():
+    def end_scan(self) -> None:
+        """Forget the endpoints that the scan did not see."""
+        if dropped := self._unknown.end_scan():
             self._stats.dropped["too_many_unknown_nodes"] += dropped
 
     def next_due(self) -> float | None:

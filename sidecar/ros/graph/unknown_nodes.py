@@ -34,11 +34,11 @@ class _Participant:
     names: dict[bytes, str | None] = field(default_factory=dict)
     """Node names by endpoint; None until known."""
     seen: set[bytes] = field(default_factory=set)
-    """Endpoints that the current look saw."""
+    """Endpoints that the current scan saw."""
 
 
 class UnknownNodes:
-    """Endpoints without a name. In each look at the graph, `name_of` is called for each that rmw has no name for."""
+    """Endpoints without a name. In each scan of the graph, `name_of` is called for each that rmw has no name for."""
 
     def __init__(self) -> None:
         self._participants: dict[bytes, _Participant] = {}
@@ -46,8 +46,8 @@ class UnknownNodes:
         self._rests_until = 0.0
         self._dropped = 0
 
-    def begin_look(self) -> None:
-        """Begin another look at the graph."""
+    def begin_scan(self) -> None:
+        """Begin another scan of the graph."""
         self._dropped = 0
         for participant in self._participants.values():
             participant.seen.clear()
@@ -69,8 +69,8 @@ class UnknownNodes:
         participant.seen.add(endpoint)
         return participant.names[endpoint]
 
-    def end_look(self) -> int:
-        """Forget the endpoints that the look did not see: they are gone, or rmw knows them.
+    def end_scan(self) -> int:
+        """Forget the endpoints that the scan did not see: they are gone, or rmw knows them.
 
         Return how many it saw that there was no room for.
         """

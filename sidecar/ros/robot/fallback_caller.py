@@ -15,7 +15,7 @@ from plr.sidecar.ros.errors import RosBridgeError
 from plr.sidecar.ros.types import load_service_type
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Mapping
+    from collections.abc import Callable, Iterable, Iterator, Mapping
 
     from plr.protos.model.ids import ServiceName
     from plr.sidecar.core.base.values import RequestId
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from plr.sidecar.ros.ros_loop import RosLoop
     from plr.sidecar.ros.stats import BridgeStats
 
-MAX_ASKED = 64
+MAX_ASKED_OF_FALLBACK = 64
 """Requests whose number at one fallback is remembered; beyond this the oldest, lost long ago, is forgotten."""
 COMPLAIN_AFTER_S = 5.0
 """How long a fallback may be missing before that is logged: the robot's nodes start together."""
@@ -51,15 +51,11 @@ class FallbackAnswer:
     late: bool
 
 
-class _Fallback:
+class Fallback:
     """A fallback found in the local graph."""
 
-    def __init__(
-        self, server: LocalServer, on_answer: Callable[[RequestId, bytes, float], None], on_stray: Callable[[], None]
-    ) -> None:
+    def __init__(self, server: LocalServer) -> None:
         self.server = server
-        self._on_answer = on_answer
-        self._on_stray = on_stray
         self._asked: dict[int, RequestId] = {}
         """Requests by rmw's sequence number."""
 
@@ -72,17 +68,13 @@ class _Fallback:
         """Send a request. Raises RosBridgeError."""
         number = self.server.send(self.server.type.request.deserialize(call.payload))
         self._asked[number] = call.request_id
-        if len(self._asked) > MAX_ASKED:
+        if len(self._asked) > MAX_ASKED_OF_FALLBACK:
             del self._asked[next(iter(self._asked))]
 
-    def take(self, now: float) -> None:
-        """Take the answers that have arrived."""
+    def take(self) -> Iterator[tuple[RequestId | None, bytes]]:
+        """Yield the answers that have arrived, each with its request; None stands for one that is not awaited."""
         for number, payload in self.server.take():
-            request_id = self._asked.pop(number, None)
-            if request_id is None:
-                self._on_stray()
-            else:
-                self._on_answer(request_id, payload, now)
+            yield self._asked.pop(number, None), payload
 
 
 @dataclass(slots=True)
@@ -106,19 +98,17 @@ class FallbackCaller:
         limited_log: LimitedLog,
         processes: ServerProcesses,
         name_of: NameOf,
-        on_answer: Callable[[FallbackAnswer, float], None],
         on_failure: Callable[[RequestFailed, float], None],
     ) -> None:
-        """Call `on_answer` to answer the application, and `on_failure` to end a request that gets no answer."""
+        """Call `on_failure` to end a request that gets no answer."""
         self._loop = loop
         self._processes = processes
         self._name_of = name_of
         self._stats = stats
         self._limited = limited_log
-        self._on_answer = on_answer
         self._on_failure = on_failure
         self._policy = Fallbacks(rules, stats.fallbacks)
-        self._fallbacks: dict[ServiceName, _Fallback] = {}
+        self._fallbacks: dict[ServiceName, Fallback] = {}
         self._up: frozenset[ServiceName] = frozenset()
         self._types: dict[ServiceName, tuple[str, float]] = {}
         """Types of the fallbacks that can be called, or could lately, and when that was last seen."""
@@ -187,11 +177,17 @@ class FallbackCaller:
         self._act(now)
         return hopeless
 
-    def _answered(self, request_id: RequestId, payload: bytes, now: float) -> None:
-        accepted = self._policy.answered(request_id, now)
-        if accepted is not None:
-            self._on_answer(FallbackAnswer(request_id, accepted.service, payload, accepted.late), now)
-        self._act(now)
+    def take(self, fallback: Fallback, now: float) -> Iterator[FallbackAnswer]:
+        """Yield the answers of `fallback` that the application gets."""
+        for request_id, payload in fallback.take():
+            if request_id is None:
+                # Its request was given up as lost, or two nodes serve one name and this is the second answer.
+                self._stats.dropped["answer_without_execution"] += 1
+                continue
+            accepted = self._policy.answered(request_id, now)
+            if accepted is not None:
+                yield FallbackAnswer(request_id, accepted.service, payload, accepted.late)
+            self._act(now)
 
     def _act(self, now: float) -> None:
         while calls := self._policy.take_calls():
@@ -213,7 +209,7 @@ class FallbackCaller:
 
     # -- what the graph shows --------------------------------------------------------------------------------------
 
-    def look(self, served: Mapping[ServiceName, Served], offers: Mapping[ServiceName, str], now: float) -> None:
+    def follow(self, served: Mapping[ServiceName, Served], offers: Mapping[ServiceName, str], now: float) -> None:
         """Track the fallbacks in the graph; they must have the types in `offers`, the services of the network."""
         retry_types = now - self._types_retried_at >= TYPE_RETRY_S
         if retry_types:
@@ -258,7 +254,7 @@ class FallbackCaller:
             self._close(service, now)
             fallback = None
         if fallback is not None:
-            if fallback.server.look(self._processes.has_ended, now):
+            if fallback.server.scan(self._processes.has_ended, now):
                 self._replaced(service, now)
             for endpoint in fallback.server.endpoints:
                 self._processes.watch(endpoint)
@@ -279,7 +275,7 @@ class FallbackCaller:
             return
         self._refused.pop(service, None)
         self._complaints.pop(service, None)
-        self._fallbacks[service] = _Fallback(server, self._answered, self._stray)
+        self._fallbacks[service] = Fallback(server)
         self._loop.set_clients(tuple(self._fallbacks.values()))
 
     def _close(self, service: ServiceName, now: float) -> None:
@@ -299,10 +295,6 @@ class FallbackCaller:
         if not complaint.told and now - complaint.since >= COMPLAIN_AFTER_S:
             complaint.told = True
             log.error("service %s has no fallback: %s", service, text)
-
-    def _stray(self) -> None:
-        """Count an answer to a request given up as lost, or a second answer because two nodes serve one name."""
-        self._stats.dropped["answer_without_execution"] += 1
 
     def _publish_state(self) -> None:
         policy = self._policy

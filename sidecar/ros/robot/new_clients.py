@@ -18,7 +18,7 @@ REST_S = 0.2
 """... and the interval between tries of any clients: each may cost the ROS thread 0.1 s."""
 GIVE_UP_S = 10.0
 """A client still unknown this long after its answer was ready is gone, or will never hear us."""
-MAX_KEPT = 4096
+MAX_KEPT_ANSWERS = 4096
 """Answers kept for all clients together."""
 
 T = TypeVar("T")
@@ -48,7 +48,7 @@ class NewClients(Generic[T]):
 
     def keep(self, client: bytes, answer: T, now: float) -> bool:
         """Keep an answer to a client that is not known yet; return False when there is no room."""
-        if self.kept >= MAX_KEPT:
+        if self.kept >= MAX_KEPT_ANSWERS:
             return False
         state = self._clients.get(client)
         if state is None:

@@ -17,7 +17,6 @@ if TYPE_CHECKING:
     from plr.protos.model.ids import ServiceName
     from plr.sidecar.core.rules.service_rule import ServiceRule
     from plr.sidecar.core.seam.application import OfferService, WithdrawService
-    from plr.sidecar.ros.rcl import RmwRequestId
     from plr.sidecar.ros.ros_loop import RosLoop
     from plr.sidecar.ros.stats import BridgeStats
 
@@ -42,8 +41,6 @@ class Proxies:
         rules: tuple[ServiceRule, ...],
         stats: BridgeStats,
         now: float,
-        on_request: Callable[[ServiceProxy, RmwRequestId, bytes, float], None],
-        on_bad_request: Callable[[ServiceProxy, RosBridgeError, float], None],
         on_closed: Callable[[ServiceProxy, int], None],
     ) -> None:
         """Call `on_closed` with the number of requests that waited unseen at the closed proxy."""
@@ -51,8 +48,6 @@ class Proxies:
         self._own_node = loop.node.get_fully_qualified_name()
         self._rules = Rules(rules)
         self._stats = stats
-        self._on_request = on_request
-        self._on_bad_request = on_bad_request
         self._on_closed = on_closed
         self.offers: dict[ServiceName, str] = {}
         """Services that servers in the network offer, with their types."""
@@ -62,7 +57,7 @@ class Proxies:
         self._free_since: dict[ServiceName, float] = {}
         self._types_retried_at = 0.0
         self.settling = False
-        """Whether a name is about to be free, so that another look is needed soon."""
+        """Whether a name is about to be free, so that another scan is needed soon."""
         self._settled_at = now + DISCOVERY_SETTLES_S
 
     def offer(self, event: OfferService) -> None:
@@ -92,7 +87,7 @@ class Proxies:
             log.warning("service %s is withdrawn: %s", event.name, event.reason)
         self._publish_state()
 
-    def look(
+    def follow(
         self, served: Mapping[ServiceName, graph.Served], fallbacks: Mapping[ServiceName, str], now: float
     ) -> Iterator[None]:
         """Compare the graph with what should be offered, in steps; create and withdraw proxies accordingly."""
@@ -146,9 +141,7 @@ class Proxies:
 
     def _open_proxy(self, name: ServiceName, type_name: str) -> None:
         try:
-            proxy = ServiceProxy(
-                self._loop.node, name, load_service_type(type_name), self._on_request, self._on_bad_request
-            )
+            proxy = ServiceProxy(self._loop.node, name, load_service_type(type_name))
         except RosBridgeError as error:
             if name not in self._missing_types:
                 self._missing_types[name] = type_name

@@ -62,7 +62,7 @@ class ReplyPacer(Generic[T]):
         state = self._refreshed(client, now)
         state.tokens = min(self._burst, state.tokens + 1.0)
 
-    def offer(self, client: bytes, reply: T, now: float, *, late: bool) -> bool:
+    def admit(self, client: bytes, reply: T, now: float, *, late: bool) -> bool:
         """Return True if `reply` may go now; otherwise keep it for `take_due`."""
         state = self._refreshed(client, now)
         cost = self._late_cost if late else 1.0

@@ -21,12 +21,13 @@ from plr.sidecar.ros.errors import RosBridgeError
 from plr.sidecar.ros.graph import graph
 from plr.sidecar.ros.graph.node_names import NodeNames
 from plr.sidecar.ros.rcl import NewClientError
-from plr.sidecar.ros.robot.fallback_caller import FallbackCaller
+from plr.sidecar.ros.robot.fallback_caller import Fallback, FallbackCaller
 from plr.sidecar.ros.robot.new_clients import GIVE_UP_S, NewClients
 from plr.sidecar.ros.robot.notices import NoticePublisher
 from plr.sidecar.ros.robot.proxies import Proxies
 from plr.sidecar.ros.robot.reply_pacer import ReplyPacer
 from plr.sidecar.ros.robot.request_numbering import RequestNumbering
+from plr.sidecar.ros.robot.service_proxy import ServiceProxy
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -38,8 +39,7 @@ if TYPE_CHECKING:
     from plr.sidecar.ros.log_limit import LimitedLog
     from plr.sidecar.ros.rcl import Message, RmwRequestId
     from plr.sidecar.ros.robot.fallback_caller import FallbackAnswer
-    from plr.sidecar.ros.robot.service_proxy import ServiceProxy
-    from plr.sidecar.ros.ros_loop import RosLoop
+    from plr.sidecar.ros.ros_loop import RosLoop, Waited
     from plr.sidecar.ros.stats import BridgeStats
 
 MAX_PENDING_REQUESTS = 4096
@@ -95,7 +95,6 @@ class RobotSide:
             limited_log=limited_log,
             processes=self._processes,
             name_of=self._names.name_of,
-            on_answer=self._answer_from_fallback,
             on_failure=self._tell_failure,
         )
         self._pending: dict[RequestId, _Pending] = {}
@@ -106,12 +105,10 @@ class RobotSide:
             rules=rules,
             stats=stats,
             now=now,
-            on_request=self._submit,
-            on_bad_request=self._bad_request,
             on_closed=self._proxy_closed,
         )
-        self.look_is_due = False
-        """Whether a look at the graph is due although it has not changed."""
+        self.scan_is_due = False
+        """Whether a scan of the graph is due although it has not changed."""
 
     # -- what the data plane says ------------------------------------------------------------------------------
 
@@ -129,7 +126,7 @@ class RobotSide:
             case OfferService():
                 self._proxies.offer(event)
                 self._publish_carried()
-                self.look_is_due = True
+                self.scan_is_due = True
             case WithdrawService():
                 self._proxies.withdraw(event, self._fallbacks.types())
                 self._publish_carried()
@@ -185,7 +182,7 @@ class RobotSide:
             answer.service,
             answer.request_id.hex(),
         )
-        self._data_plane.answered_here(answer.request_id)
+        self._data_plane.answered_locally(answer.request_id)
 
     def _answer(
         self, request_id: RequestId, payload: bytes | memoryview, now: float, *, late: bool
@@ -203,7 +200,7 @@ class RobotSide:
         del self._pending[request_id]
         self._stats.pending = len(self._pending)
         answer = _Answer(pending.client, pending.proxy, pending.rmw_request_id, response)
-        if self._pacer.offer(pending.client, answer, now, late=late):
+        if self._pacer.admit(pending.client, answer, now, late=late):
             self._send(answer, now)
         else:
             self._stats.answers_paced += 1
@@ -241,7 +238,7 @@ class RobotSide:
         client, oldest = due
         if self._try_to_send(oldest, now):
             for answer in self._new_clients.known(client):
-                if self._pacer.offer(client, answer, now, late=False):
+                if self._pacer.admit(client, answer, now, late=False):
                     self._send(answer, now)
         else:
             for answer in self._new_clients.unknown(client, time.monotonic()):
@@ -270,7 +267,19 @@ class RobotSide:
         )
         self._notices.request_failed(event)
 
-    # -- what applications ask -----------------------------------------------------------------------------------
+    # -- what applications ask, and what fallbacks answer -----------------------------------------------------------
+
+    def take(self, entity: Waited, now: float) -> None:
+        """Pass on the requests that have arrived at a proxy, or give applications the answers of a fallback."""
+        if isinstance(entity, ServiceProxy):
+            for request in entity.take():
+                if isinstance(request, RosBridgeError):
+                    self._bad_request(entity, request, now)
+                else:
+                    self._submit(entity, *request, now)
+        elif isinstance(entity, Fallback):
+            for answer in self._fallbacks.take(entity, now):
+                self._answer_from_fallback(answer, now)
 
     def _submit(self, proxy: ServiceProxy, rmw_request_id: RmwRequestId, payload: bytes, now: float) -> None:
         self._stats.requests_taken[proxy.name] += 1
@@ -305,23 +314,23 @@ class RobotSide:
     # -- what the graph shows ------------------------------------------------------------------------------------
 
     def settling(self) -> bool:
-        """Return whether another look at the graph should follow soon, even if it does not change."""
+        """Return whether another scan of the graph should follow soon, even if it does not change."""
         return self._fallbacks.settling or self._proxies.settling
 
-    def look(self) -> Iterator[None]:
+    def scan(self) -> Iterator[None]:
         """Compare the graph with what is offered and with the fallbacks, in small steps."""
         if not self._proxies.offers and not self._fallbacks.configured:
             return
         wanted = frozenset(self._proxies.offers) | self._fallbacks.wanted
-        self._names.begin_look()
+        self._names.begin_scan()
         served = yield from graph.scan(self._loop.node, self._names.name_of, wanted.__contains__, time.monotonic())
         self._stats.scans += 1
         now = time.monotonic()
-        self._fallbacks.look(served, self._proxies.offers, now)
-        self._names.end_look()
+        self._fallbacks.follow(served, self._proxies.offers, now)
+        self._names.end_scan()
         self._processes.forget_the_gone()
         yield
-        yield from self._proxies.look(served, self._fallbacks.types(), now)
+        yield from self._proxies.follow(served, self._fallbacks.types(), now)
         self._publish_carried()
 
     def _publish_carried(self) -> None:
@@ -353,7 +362,7 @@ class RobotSide:
                 self._send(answer, now)
         self._try_new_client(now)
         if self._names.turn(now):
-            self.look_is_due = True
+            self.scan_is_due = True
 
     def close(self) -> None:
         """Withdraw every service."""

@@ -9,7 +9,7 @@ from plr.sidecar.ros.rcl import Message, RmwRequestId, send_response, take_reque
 from plr.sidecar.ros.ros_loop import service_qos
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Iterator
 
     from plr.protos.model.ids import ServiceName
     from plr.sidecar.ros.types import ServiceType
@@ -21,22 +21,14 @@ TAKEN_AT_ONCE = 32
 
 
 class ServiceProxy:
-    """A ROS service whose requests go to `on_request` as bytes, with rmw's header to answer them by."""
+    """A ROS service that takes requests as bytes, with rmw's header to answer them by."""
 
-    def __init__(
-        self,
-        node: Any,
-        name: ServiceName,
-        service_type: ServiceType,
-        on_request: Callable[[ServiceProxy, RmwRequestId, bytes, float], None],
-        on_bad_request: Callable[[ServiceProxy, RosBridgeError, float], None],
-    ) -> None:
+    def __init__(self, node: Any, name: ServiceName, service_type: ServiceType) -> None:
+        """Create the service; raise RosBridgeError if rmw refuses."""
         self.name = name
         self.type = service_type
         self.open = True
         self._node = node
-        self._on_request = on_request
-        self._on_bad_request = on_bad_request
         try:
             self._service = node.create_service(
                 service_type.service, name, _unused, qos_profile=service_qos(QUEUE_DEPTH)
@@ -51,17 +43,17 @@ class ServiceProxy:
         """rclpy's handle."""
         return self._service.handle
 
-    def take(self, now: float) -> None:
-        """Take the requests that have arrived."""
+    def take(self) -> Iterator[tuple[RmwRequestId, bytes] | RosBridgeError]:
+        """Yield the requests that have arrived, a limited number at a time; for one that is unreadable, the error."""
         for _ in range(TAKEN_AT_ONCE):
             try:
                 taken = take_request(self._pointer, self.type.request)
             except RosBridgeError as error:
-                self._on_bad_request(self, error, now)
+                yield error
                 continue
             if taken is None:
                 return
-            self._on_request(self, *taken, now)
+            yield taken
 
     def parse_answer(self, payload: bytes | memoryview) -> Message:
         """Return the response in `payload`, or raise RosBridgeError."""

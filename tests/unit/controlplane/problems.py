@@ -9,14 +9,14 @@ from typing import TYPE_CHECKING
 
 from plr.controlplane.core.problem.costs import RULE_PRICE, TIE_PRICE
 from plr.controlplane.core.problem.objectives import PROBABILITY_FLOOR
-from plr.controlplane.core.problem.plan import Price
+from plr.controlplane.core.problem.plan import PlanCost
 from plr.controlplane.core.problem.problem import (
     Block,
     BlockKey,
     Choice,
     FleetKey,
     Objective,
-    Path,
+    PairIndex,
     Problem,
     Target,
     block_excess,
@@ -40,7 +40,7 @@ def block(
     capacity: int = 1,
     idempotent: bool = True,
     service: ServiceName = PLAN,
-    lifts: dict[tuple[Path, Path], float] | None = None,
+    lifts: dict[tuple[PairIndex, PairIndex], float] | None = None,
     copies: Copies = EVERY_INTERFACE,
     regions: tuple[str, ...] = (),
     carriers: tuple[str, ...] = (),
@@ -129,7 +129,9 @@ def fleet(rng: random.Random, robots: int, interfaces: int, servers: int, object
     return Problem(tuple(blocks), limits, objective)
 
 
-def random_lifts(rng: random.Random, epsilon: list[list[float | None]], share: float) -> dict[tuple[Path, Path], float]:
+def random_lifts(
+    rng: random.Random, epsilon: list[list[float | None]], share: float
+) -> dict[tuple[PairIndex, PairIndex], float]:
     """Lifts of a share of all pairs of paths: below 1, far above, or 0."""
     paths = [(i, j) for i, row in enumerate(epsilon) for j, value in enumerate(row) if value is not None]
     return {
@@ -217,19 +219,19 @@ def plain_objective(objective: Objective, part: Block, choice: Choice) -> float:
             return math.log(all_miss(part, choice))
 
 
-def best_price(problem: Problem) -> Price:
+def best_price(problem: Problem) -> PlanCost:
     """The least price of all valid choices."""
     options = [
         [(choice, plain_cost(problem.objective, part, choice)) for choice in valid_choices(part)]
         for part in problem.blocks
     ]
-    best = Price(10**9, 0.0)
+    best = PlanCost(10**9, 0.0)
     for combination in itertools.product(*options):
         chosen = {part.key: choice for part, (choice, _) in zip(problem.blocks, combination, strict=True)}
         excess = sum(block_excess(part, chosen[part.key]) for part in problem.blocks)
         if excess <= best.excess:
             excess += sum(fleet_excess(problem, chosen).values())
-            best = min(best, Price(excess, sum(cost for _, cost in combination)))
+            best = min(best, PlanCost(excess, sum(cost for _, cost in combination)))
     return best
 
 

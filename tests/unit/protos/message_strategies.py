@@ -11,7 +11,13 @@ from hypothesis import strategies as st
 from plr.protos.base.histogram import BUCKETS, MAX_COUNT, Histogram
 from plr.protos.base.size_class import SIZE_CLASSES
 from plr.protos.convert.control import MAX_WALL_S
-from plr.protos.convert.fields import MAX_CAPACITY, MAX_COPIES, MAX_COST_PER_REQUEST, MAX_DURATION_S, MAX_EVENTS
+from plr.protos.convert.fields import (
+    MAX_CAPACITY,
+    MAX_COST_PER_REQUEST,
+    MAX_DURATION_S,
+    MAX_MAPPED_COPIES,
+    MAX_REPORTED_COUNT,
+)
 from plr.protos.convert.types import LEAST_TARGET
 from plr.protos.model.explanation import (
     Alternative,
@@ -87,7 +93,7 @@ credentials = st.binary(max_size=MAX_CREDENTIAL_BYTES)
 signatures = st.binary(max_size=MAX_SIGNATURE_BYTES)
 durations = st.integers(1, round(MAX_DURATION_S * 1e6)).map(lambda us: us / 1_000_000)
 probabilities = st.floats(0.0, 1.0)
-events = st.integers(0, MAX_EVENTS)
+events = st.integers(0, MAX_REPORTED_COUNT)
 
 
 def _of_one_host(address: Address) -> bool:
@@ -133,8 +139,8 @@ def _tuples(
 
 costs = st.floats(0.0, MAX_COST_PER_REQUEST)
 domain_labels = st.just("") | st.from_regex(r"[A-Za-z0-9][A-Za-z0-9_.&+-]{0,10}", fullmatch=True)
-copies = st.tuples(st.integers(0, MAX_COPIES), st.just(0)) | st.tuples(
-    st.integers(1, MAX_COPIES), st.integers(1, MAX_COPIES)
+copies = st.tuples(st.integers(0, MAX_MAPPED_COPIES), st.just(0)) | st.tuples(
+    st.integers(1, MAX_MAPPED_COPIES), st.integers(1, MAX_MAPPED_COPIES)
 ).map(sorted)
 offers = st.builds(ServiceOffer, service_names, type_names, st.integers(0, MAX_CAPACITY), costs)
 uses = st.builds(
@@ -317,7 +323,7 @@ statuses = st.builds(
 )
 
 beliefs = st.tuples(probabilities, probabilities, probabilities).map(lambda three: Belief(three[0], *sorted(three[1:])))
-weights = st.floats(0.0, MAX_EVENTS)
+weights = st.floats(0.0, MAX_REPORTED_COUNT)
 wall_times = st.integers(0, MAX_WALL_S * 1000).map(lambda ms: ms / 1000)
 fleet_events = st.builds(
     FleetEvent,
@@ -366,7 +372,7 @@ explained_joints = st.builds(
     interface_names,
     interface_names,
     st.none() | node_names,
-    *[st.floats(1e-3, MAX_EVENTS)] * 3,
+    *[st.floats(1e-3, MAX_REPORTED_COUNT)] * 3,
     weights,
     st.sampled_from(Correlation),
     _tuples(texts),

@@ -51,7 +51,7 @@ class NoRoom:
         """Let a request wait if it could be sent now (or again) and lacks nothing but room; return whether it waits."""
         if request.id in self._waiting:
             return True
-        if request.answered_here or not request.may_be_sent():
+        if request.answered_locally or not request.may_be_sent():
             return False
         reached = self._reached(self._dispatching.candidates(request, rejected=rejected))
         lane = Lane.of(request.size)

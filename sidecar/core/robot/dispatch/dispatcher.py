@@ -26,9 +26,9 @@ if TYPE_CHECKING:
     from plr.sidecar.core.base.values import PathId
     from plr.sidecar.core.robot.dispatch.context import RequestParts
 
-MAX_COPIES = 8
+MAX_COPIES_OF_REQUEST = 8
 """Most copies of one request, including those sent in trouble."""
-MAX_ASKED = 16
+MAX_COPIES_WHILE_REFUSED = 16
 """The same while it is certain that no server ran any of them, and each was given time to become ready."""
 
 
@@ -157,7 +157,7 @@ class Dispatching:
         waiting = request.relied_on()
         if request.is_answered or (waiting and not request.rule.redundancy.helps):
             return
-        if rejected and len(request.copies) >= MAX_COPIES:
+        if rejected and len(request.copies) >= MAX_COPIES_OF_REQUEST:
             return  # its retry keeps asking, at a slower pace
         alive = any(routes.state(copy.path) is not PathState.DOWN for copy in waiting)
         if alive and not insist and MODES[request.rule.redundancy].watches(self, request, now):
@@ -244,9 +244,9 @@ class Dispatching:
             self._budgets.earn(request.copies[0].message.symbols.total, {path.interface for path in paths})
 
     def _send(self, request: Request, path: PathId, now: float, why: _Why) -> bool:
-        """Send a copy for which the path's server has room; return whether the budgets and MAX_COPIES allowed it."""
+        """Send a copy for which the path's server has room; return whether budgets and MAX_COPIES_OF_REQUEST allow it."""
         sent = len(request.copies)
-        if request.payload is None or (sent >= MAX_COPIES and sent >= _most_copies(request)):
+        if request.payload is None or (sent >= MAX_COPIES_OF_REQUEST and sent >= _most_copies(request)):
             return False
         rule, stats = request.rule, self._parts.stats
         extra = bool(request.copies and request.relied_on())
@@ -292,4 +292,4 @@ class Dispatching:
 
 def _most_copies(request: Request) -> int:
     patient = request.retry_at is None and request.certainly_not_run()
-    return MAX_ASKED if patient else MAX_COPIES
+    return MAX_COPIES_WHILE_REFUSED if patient else MAX_COPIES_OF_REQUEST

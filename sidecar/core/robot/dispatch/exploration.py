@@ -32,11 +32,11 @@ MAX_SAVED = 6.0
 MIN_INTERVAL_S = 0.5
 """Least time between two copies of one service, so that they do not all measure the same moment."""
 
-MAX_REQUEST_BYTES = 128 * 1024
+MAX_EXPLORING_BYTES = 128 * 1024
 """Larger requests are not worth exploring with. A service costs at most 1.6 MB a minute more."""
 
-MAX_MAPPED_COPIES = 4
-"""A request with more copies does not explore: half of `dispatcher.MAX_COPIES`, the rest is for trouble."""
+MAX_COPIES_TO_EXPLORE = 4
+"""A request with more copies does not explore: half of `dispatcher.MAX_COPIES_OF_REQUEST`, the rest is for trouble."""
 
 MAX_WAITING_MESSAGES = 4
 """An interface with more undelivered messages is busy: an unnecessary copy would hold others up."""
@@ -124,5 +124,5 @@ class Exploration:
 
 
 def _may_explore(request: Request) -> bool:
-    small = len(request.payload or b"") <= MAX_REQUEST_BYTES
-    return small and 0 < len(request.copies) <= MAX_MAPPED_COPIES and request.races
+    small = len(request.payload or b"") <= MAX_EXPLORING_BYTES
+    return small and 0 < len(request.copies) <= MAX_COPIES_TO_EXPLORE and request.races

@@ -112,7 +112,7 @@ class PathPaces:
 
 WINDOW = 128
 """Copies remembered for each pair: enough for a quantile of 0.99, see `quantile_s`."""
-MAX_AGE_S = 120.0
+MAX_SAMPLE_AGE_S = 120.0
 """After two minutes of driving the road has changed; older copies tell nothing."""
 MAX_RECORDS = 4096
 """Pairs remembered, each for one service; beyond that the least recently used one goes."""
@@ -156,7 +156,7 @@ class PathRecords:
 
     def _recent(self, service: ServiceName, path: PathId, now: float) -> list[_Sample]:
         samples = self._samples.get(_Key(service, path.interface, path.peer), ())
-        return [sample for sample in samples if sample.at >= now - MAX_AGE_S]
+        return [sample for sample in samples if sample.at >= now - MAX_SAMPLE_AGE_S]
 
     def miss_share(self, service: ServiceName, path: PathId, now: float) -> float:
         """Return the share of its copies that the pair is expected to answer late or never."""

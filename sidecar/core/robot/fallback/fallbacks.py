@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 MAX_WANTED = 64
 """Most requests that wait for one fallback; a longer queue helps nobody."""
-MAX_HELD_BYTES = 256 * 1024 * 1024
+MAX_FALLBACK_BYTES = 256 * 1024 * 1024
 """Most payload bytes kept for fallbacks, as many as for the network: it may give up before the fallbacks do."""
 MAX_ATTEMPTS = 4
 """Most times that a fallback is asked one request. A request lost with a fallback is asked again, as the fallback may
@@ -114,7 +114,7 @@ class Fallbacks:
         queue = self._queues.get(service)
         if queue is None:
             return
-        if self._held_bytes + len(payload) > MAX_HELD_BYTES:
+        if self._held_bytes + len(payload) > MAX_FALLBACK_BYTES:
             self._outcomes[service, "overloaded"] += 1
             return
         request = FallbackRequest(request_id, payload, now + queue.deadline_s, now + queue.lifetime_s)
@@ -141,7 +141,7 @@ class Fallbacks:
     def has_answered(self, request_id: RequestId) -> bool:
         """Return whether the application has its answer from the fallback."""
         found = self._requests.get(request_id)
-        return found is not None and found[1].answered_here
+        return found is not None and found[1].answered_locally
 
     def network_answered(self, request_id: RequestId, now: float) -> None:
         """Note that the application has a valid answer from the network."""
@@ -203,7 +203,7 @@ class Fallbacks:
         else:
             self._outcomes[name, "late" if late else "won"] += 1
             if not (late and queue.drop_late):
-                request.answered = request.answered_here = True
+                request.answered = request.answered_locally = True
                 accepted = Accepted(name, late)
         self._end(name, request)
         self._call(name, now)

@@ -89,7 +89,7 @@ class FallbackRequest:
     called_at: float = 0.0
     answered: bool = False
     """The application has its answer."""
-    answered_here: bool = False
+    answered_locally: bool = False
     """The application has its answer from the fallback."""
     network_over: bool = False
     failure: RequestFailed | None = None

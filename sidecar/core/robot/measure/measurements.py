@@ -12,7 +12,7 @@ from plr.protos.base.size_class import size_class
 from plr.protos.model.report import (
     MAX_JOINTS,
     MAX_LATENCIES,
-    MAX_PATHS,
+    MAX_PATH_REPORTS,
     InterfaceJointReport,
     JointReport,
     LatencyReport,
@@ -128,7 +128,7 @@ class Measurements:
 
     def note_path_change(self, path: PathId) -> None:
         """Note that a path went up or down."""
-        if len(self._changed) < MAX_PATHS:
+        if len(self._changed) < MAX_PATH_REPORTS:
             self._changed[path.interface, path.peer] = None
 
     def take_urgency(self) -> ReportScope | None:
@@ -263,13 +263,13 @@ class Measurements:
 
     def _in_turn(self, paths: list[tuple[InterfaceName, NodeName]]) -> list[tuple[InterfaceName, NodeName]]:
         """Return as many paths as one report holds, from where the last one ended, so that all have their turn."""
-        left_out = len(paths) - MAX_PATHS
+        left_out = len(paths) - MAX_PATH_REPORTS
         if left_out <= 0:
             return paths
         self._dropped["path_reports_full"] += left_out
         first = self._next_path % len(paths)
-        self._next_path = first + MAX_PATHS
-        return (paths[first:] + paths[:first])[:MAX_PATHS]
+        self._next_path = first + MAX_PATH_REPORTS
+        return (paths[first:] + paths[:first])[:MAX_PATH_REPORTS]
 
     def _path_report(self, interface: InterfaceName, server: NodeName, routes: Routes) -> PathReport:
         """Return one report for all paths between the two: the mapping knows interfaces and servers only."""

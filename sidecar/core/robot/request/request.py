@@ -119,7 +119,7 @@ class Request:
     done: bool = False
     """The application got its response, or the request failed."""
     missed: bool = False
-    answered_here: bool = False
+    answered_locally: bool = False
     """The application got its answer on the robot. No more copies are sent; those under way are awaited until the
     deadline for what they tell about their paths."""
     judged: int = 0
@@ -141,7 +141,7 @@ class Request:
     @property
     def is_answered(self) -> bool:
         """Return whether the application has an answer or is judging one: meanwhile no copy is sent."""
-        return self.answered_here or self.judged > 0
+        return self.answered_locally or self.judged > 0
 
     def pending(self) -> list[Copy]:
         return [copy for copy in self.copies if copy.state is CopyState.PENDING]

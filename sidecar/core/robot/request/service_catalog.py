@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 MAX_TYPES = 2048
 """Services whose type is remembered; beyond that the one noted longest ago goes. Peers invent names under a glob."""
 
-MAX_OFFERED = 512
+MAX_OFFERED_SERVICES = 512
 """Services offered on the robot; each costs DDS endpoints and a slot in every wait. One peer may have half."""
 WITHDRAW_AFTER_S = 15.0
 """Longer than a handover, a tunnel or the restart of a server, shorter than a person's patience with a dead service."""
@@ -52,7 +52,7 @@ class Offers:
         self._budgeted = budgeted
         self._stats = stats
         self._offered: dict[ServiceName, str] = {}
-        self._shares = Shares(MAX_OFFERED)
+        self._shares = Shares(MAX_OFFERED_SERVICES)
         self._charged: dict[ServiceName, NodeName] = {}
         """Offered service -> the peer whose share it counts in: one of its servers when it was offered."""
         self._refused: set[ServiceName] = set()

@@ -15,7 +15,7 @@ from cryptography.x509.oid import AttributeOID, ExtendedKeyUsageOID, NameOID
 
 from plr.controlplane.ca.certificates import alternative_names, generate_key
 from plr.controlplane.ca.key_file import clear_pem
-from plr.controlplane.ca.request import MAX_REQUEST_BYTES, build_request, fingerprint, parse_request
+from plr.controlplane.ca.request import MAX_CERTIFICATE_REQUEST_BYTES, build_request, fingerprint, parse_request
 from plr.protos.base.errors import DecodeError
 from plr.protos.trust.identity import CONTROL_PLANE_DNS, IdentityRole
 
@@ -169,8 +169,8 @@ def test_a_subject_that_says_something_else_is_refused(subject: list[x509.NameAt
 
 def test_a_large_request_is_refused_before_it_is_looked_into() -> None:
     pem = build_request("robot-1", IdentityRole.ROBOT, KEY)
-    parse_request(pem.ljust(MAX_REQUEST_BYTES, b"\n"))
-    assert "longer than 4096 bytes" in refusal(pem.ljust(MAX_REQUEST_BYTES + 1, b"\n"))
+    parse_request(pem.ljust(MAX_CERTIFICATE_REQUEST_BYTES, b"\n"))
+    assert "longer than 4096 bytes" in refusal(pem.ljust(MAX_CERTIFICATE_REQUEST_BYTES + 1, b"\n"))
 
 
 @pytest.mark.parametrize("pem", [b"", b"x", clear_pem(KEY), b"-----BEGIN CERTIFICATE REQUEST-----\nAAAA\n-----END"])

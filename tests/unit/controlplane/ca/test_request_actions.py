@@ -11,7 +11,7 @@ import pytest
 from plr.controlplane.ca.certificates import generate_key
 from plr.controlplane.ca.folder import AuthorityFolder
 from plr.controlplane.ca.key_file import clear_pem
-from plr.controlplane.ca.request import MAX_REQUEST_BYTES, build_request
+from plr.controlplane.ca.request import MAX_CERTIFICATE_REQUEST_BYTES, build_request
 from plr.protos.program.tls_files import load_tls_files
 from plr.protos.trust.identity import IdentityRole
 from tests.unit.controlplane.ca.shell import at_a_terminal
@@ -188,7 +188,7 @@ def test_a_key_that_lies_beside_the_ca_is_not_mixed_with_a_signed_request(shell:
     [
         (b"", "malformed"),
         (b"\x1b[2J" * 10, "malformed"),
-        (b"x" * (MAX_REQUEST_BYTES + 1), "longer than"),
+        (b"x" * (MAX_CERTIFICATE_REQUEST_BYTES + 1), "longer than"),
         (clear_pem(generate_key()), "malformed"),
         (build_request("robot-1", IdentityRole.ROBOT, generate_key())[:-60], "malformed"),
     ],

@@ -8,7 +8,7 @@ from dataclasses import replace
 import pytest
 
 from plr.controlplane.cli import status_table
-from plr.controlplane.cli.status_table import MAX_HINTED, MAX_LINE, MAX_LINES, render
+from plr.controlplane.cli.status_table import MAX_HINTED, MAX_LINE_CHARACTERS, MAX_LINES_OF_SIDECAR, render
 from plr.protos.model.ids import InterfaceName, NodeName, Role, ServiceName, SessionId, Version
 from plr.protos.model.mapping import Assignment, ServiceMapping
 from plr.protos.model.members import HeldList, Peer, RevocationSet, ServiceOffer
@@ -126,8 +126,8 @@ def test_what_one_says_of_itself_takes_no_room_of_the_others() -> None:
     assert len(rows["quiet"]) < 150
     assert rows["quiet"].split()[-2:] == [f"{PLAN},/other", "1"]
     assert "and 1023 more" in rows["loud"]
-    assert max(map(len, text.splitlines())) < 2 + MAX_LINE + 1
-    assert len(text.splitlines()) < MAX_LINES + 10
+    assert max(map(len, text.splitlines())) < 2 + MAX_LINE_CHARACTERS + 1
+    assert len(text.splitlines()) < MAX_LINES_OF_SIDECAR + 10
     assert text.splitlines()[-1] == "  and 769 more: plr status loud --json"
 
 
@@ -147,7 +147,7 @@ def test_what_is_wrong_is_not_cut_off() -> None:
     robot = Peer(NodeName("robot"), Role.ROBOT, SessionId(1), b"", 1)
     mappings = tuple(
         ServiceMapping(ServiceName(f"/s{number}"), (Assignment(InterfaceName("wlan0"), NodeName("EDGE-1")),), 0.1, "")
-        for number in range(2 * MAX_LINES)
+        for number in range(2 * MAX_LINES_OF_SIDECAR)
     )
     nowhere = ServiceMapping(ServiceName("/last"), (), 1.0, "")
     down = (InterfaceName("wwan0"),)

@@ -139,7 +139,7 @@ def test_a_wrong_number_costs_one_event(tmp_path: Path, wrong: int, place: int) 
 
 
 def test_the_file_is_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(event_log, "MAX_FILE_BYTES", 20_000)
+    monkeypatch.setattr(event_log, "MAX_EVENT_FILE_BYTES", 20_000)
     monkeypatch.setattr("plr.controlplane.core.explain.event_memory.MAX_EVENTS", 50)
     log = EventLog(tmp_path)
     for number in range(2000):

@@ -15,7 +15,7 @@ from plr.controlplane.cli.status_table import render
 from plr.controlplane.config.controlplane import ControlPlaneConfig
 from plr.controlplane.core.control.events import Settings
 from plr.controlplane.core.estimate.fading import FadedHistogram
-from plr.controlplane.core.estimate.network import PathView
+from plr.controlplane.core.estimate.network import ReportedPath
 from plr.controlplane.core.estimate.unanswered import LATELY_S
 from plr.controlplane.core.explain.departed import Departure
 from plr.controlplane.core.explain.fleet_view import MAX_VIEWED, InterfaceView, MemberView, MissView, ServedView
@@ -24,7 +24,7 @@ from plr.controlplane.core.registry.registry import Refusal
 from plr.controlplane.loop import ControlLoop
 from plr.controlplane.observe.event_log import EventLog
 from plr.controlplane.observe.fleet_metrics import (
-    MAX_GONE,
+    MAX_GONE_WITH_SERIES,
     MAX_SERIES,
     MAX_SERIES_OF_SERVICES,
     REUSED_S,
@@ -468,7 +468,7 @@ def robot_view(name: str, interfaces: int, servers: int, services: int) -> Membe
         role=Role.ROBOT,
         connected=True,
         seen_at=0.0,
-        paths=tuple(PathView(nic, cloud, True, 0.03) for nic in nics for cloud in clouds),
+        paths=tuple(ReportedPath(nic, cloud, True, 0.03) for nic in nics for cloud in clouds),
         mapping=tuple(
             ServiceMapping(service, tuple(Assignment(nic, cloud) for nic, cloud in zip(nics, clouds, strict=False)))
             for service in names
@@ -502,7 +502,7 @@ def test_a_thousand_robots_take_as_many_series_as_documented(services: int, expe
 def test_series_are_bounded_and_one_robot_takes_none_of_others() -> None:
     robots = [robot_view(f"robot-{number}", 3, 5, 4) for number in range(999)]
     greedy = robot_view("greedy", 64, 64, 64)
-    found = series(families(fleet([greedy, *robots], gone=MAX_GONE)))
+    found = series(families(fleet([greedy, *robots], gone=MAX_GONE_WITH_SERIES)))
     assert len(found) <= MAX_SERIES + 1
     of_robot = Counter(dict(labels).get("robot") for _, labels in found)
     assert {of_robot[f"robot-{number}"] for number in range(999)} == {74}
@@ -525,8 +525,11 @@ def test_servers_have_equal_shares_for_their_services_and_what_is_missed_comes_f
 
 def test_also_as_many_members_as_can_be_there_at_all() -> None:
     robots = [robot_view(f"robot-{number}", 8, 8, 8) for number in range(4096)]
-    assert len(series(families(fleet(robots, gone=MAX_GONE)))) <= MAX_SERIES + 1
-    assert len(series(families(fleet(robots[:3000], gone=MAX_GONE, clouds=1096, services=64)))) <= MAX_SERIES + 1
+    assert len(series(families(fleet(robots, gone=MAX_GONE_WITH_SERIES)))) <= MAX_SERIES + 1
+    assert (
+        len(series(families(fleet(robots[:3000], gone=MAX_GONE_WITH_SERIES, clouds=1096, services=64))))
+        <= MAX_SERIES + 1
+    )
 
 
 @pytest.mark.parametrize("seconds", [0.001, 0.03, 5.0])

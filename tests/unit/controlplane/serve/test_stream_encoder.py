@@ -46,7 +46,7 @@ def test_parts_make_the_set_that_the_sidecar_is_told(present: tuple[Peer, ...], 
 
 
 def test_what_is_kept_is_bounded_and_never_another_peers(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(stream_encoder, "MAX_KEPT", 10)
+    monkeypatch.setattr(stream_encoder, "MAX_KEPT_ENCODINGS", 10)
     encoder = StreamEncoder()
     for number in range(100):
         told = ToldPeers(

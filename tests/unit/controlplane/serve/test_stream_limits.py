@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from plr.controlplane.serve.stream_limits import (
-    MAX_MESSAGE_BYTES,
+    MAX_STREAM_MESSAGE_BYTES,
     MAX_STREAMS_PER_NAME,
     MESSAGES_BURST,
     MESSAGES_PER_S,
@@ -37,8 +37,8 @@ def test_who_sends_without_pause_is_too_fast() -> None:
 
 def test_large_messages_count_by_their_size() -> None:
     rate = StreamRate(report_interval_s=0.5, now=0.0)
-    assert rate.take(MAX_MESSAGE_BYTES, 0.0)
-    assert not rate.take(MAX_MESSAGE_BYTES, 0.0)
+    assert rate.take(MAX_STREAM_MESSAGE_BYTES, 0.0)
+    assert not rate.take(MAX_STREAM_MESSAGE_BYTES, 0.0)
 
 
 def test_streams_are_counted_by_name_and_forgotten_when_they_end() -> None:

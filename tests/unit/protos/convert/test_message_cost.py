@@ -12,7 +12,7 @@ from plr.protos.base.errors import DecodeError, UnknownKindError
 from plr.protos.base.histogram import BUCKETS
 from plr.protos.convert import message_cost, parse_sidecar_message, sidecar_message_to_proto
 from plr.protos.convert.message_cost import CHEAP_BYTES, SPARE_FIELDS, check_cost
-from plr.protos.model.report import MAX_LATENCIES, MAX_PATHS, Report
+from plr.protos.model.report import MAX_LATENCIES, MAX_PATH_REPORTS, Report
 from plr.protos.model.stream import Heartbeat, SidecarMessage
 from plr.protos.plr.v1 import control_pb2, types_pb2
 from tests.support.samples import histogram, latency, path
@@ -54,10 +54,12 @@ def test_what_is_bloated_is_never_parsed(kind: str, monkeypatch: pytest.MonkeyPa
 
 def test_lists_as_long_as_they_may_be_are_taken() -> None:
     empty = histogram()
-    longest = Report(latencies=(latency("if0", "a", empty),) * MAX_LATENCIES, paths=(path("if0", "a"),) * MAX_PATHS)
+    longest = Report(
+        latencies=(latency("if0", "a", empty),) * MAX_LATENCIES, paths=(path("if0", "a"),) * MAX_PATH_REPORTS
+    )
     found = parse_sidecar_message(sidecar_message_to_proto(longest).SerializeToString())
     assert isinstance(found, Report)
-    assert (len(found.latencies), len(found.paths)) == (MAX_LATENCIES, MAX_PATHS)
+    assert (len(found.latencies), len(found.paths)) == (MAX_LATENCIES, MAX_PATH_REPORTS)
 
 
 @given(message=sidecar_messages)

@@ -9,7 +9,7 @@ from plr.protos.base.errors import DecodeError
 from plr.protos.convert import parse_in_parts, parse_sidecar_message, sidecar_message_to_proto
 from plr.protos.convert.reports import PART_ENTRIES
 from plr.protos.model.ids import InterfaceName, NodeName, ServiceName
-from plr.protos.model.report import MAX_PATHS, PenaltyReport, Report
+from plr.protos.model.report import MAX_PATH_REPORTS, PenaltyReport, Report
 from plr.protos.model.stream import Heartbeat
 from plr.protos.plr.v1 import control_pb2
 from tests.support.samples import histogram, latency, path
@@ -66,7 +66,7 @@ def test_parts_teach_what_the_whole_teaches() -> None:
 @pytest.mark.audit("ops-20")
 def test_what_is_no_report_is_refused_in_parts_too() -> None:
     one = sidecar_message_to_proto(Report(paths=(path("wlan0", "a"),))).report.paths[0]
-    too_many = control_pb2.SidecarMessage(report=control_pb2.Report(paths=[one] * (MAX_PATHS + 1)))
+    too_many = control_pb2.SidecarMessage(report=control_pb2.Report(paths=[one] * (MAX_PATH_REPORTS + 1)))
     bad = sidecar_message_to_proto(LONG)
     bad.report.paths[-1].interface = "no name"
     for data in (too_many.SerializeToString(), bad.SerializeToString(), b"\xff"):

@@ -13,7 +13,7 @@ import pytest
 from prometheus_client import CollectorRegistry, Gauge
 
 from plr.protos.program import metrics_server
-from plr.protos.program.metrics_server import MAX_CONNECTIONS, MetricsServer
+from plr.protos.program.metrics_server import MAX_SCRAPES, MetricsServer
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -55,13 +55,13 @@ def test_connections_that_say_nothing_are_few_and_end(server: MetricsServer) -> 
     with contextlib.ExitStack() as stack:
         idle = [
             stack.enter_context(socket.create_connection(("127.0.0.1", server.port), 10.0))
-            for _ in range(4 * MAX_CONNECTIONS)
+            for _ in range(4 * MAX_SCRAPES)
         ]
         idle[0].sendall(b"GET /metrics HT")
         # The last ones find no room, the first ones run out of time: all are closed by the other side.
         with contextlib.suppress(ConnectionError):
             assert idle[-1].recv(1) == b""
-        assert handlers() - before <= MAX_CONNECTIONS
+        assert handlers() - before <= MAX_SCRAPES
         for one in idle:
             with contextlib.suppress(ConnectionError):
                 assert one.recv(1) == b""

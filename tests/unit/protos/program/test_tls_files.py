@@ -14,7 +14,7 @@ from plr.controlplane.ca import Authority
 from plr.controlplane.ca.files import write_tls_files
 from plr.protos.base.errors import ConfigError
 from plr.protos.model.ids import NodeName
-from plr.protos.program.tls_files import MAX_FILE_BYTES, RefusedFiles, TlsWatch, load_tls_files
+from plr.protos.program.tls_files import MAX_TLS_FILE_BYTES, RefusedFiles, TlsWatch, load_tls_files
 from plr.protos.trust.identity import CertificateError, IdentityRole
 
 if TYPE_CHECKING:
@@ -77,7 +77,7 @@ BREAKAGES: list[Breakage] = [
     ("cert.pem", lambda path: path.unlink(), "there is no such file"),
     ("cert.pem", lambda path: path.write_bytes(b""), "expected one certificate in PEM"),
     ("cert.pem", lambda path: path.write_bytes(path.read_bytes() * 2), "expected one certificate in PEM"),
-    ("cert.pem", lambda path: path.write_bytes(bytes(MAX_FILE_BYTES + 1)), "expected at most"),
+    ("cert.pem", lambda path: path.write_bytes(bytes(MAX_TLS_FILE_BYTES + 1)), "expected at most"),
     (
         "cert.pem",
         lambda path: path.write_bytes(other_ca().issue("robot-1", IdentityRole.ROBOT).certificate_pem),

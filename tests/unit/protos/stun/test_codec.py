@@ -10,7 +10,7 @@ import pytest
 
 from plr.protos.base.errors import DecodeError
 from plr.protos.stun.codec import (
-    MAX_MESSAGE_BYTES,
+    MAX_STUN_BYTES,
     MAX_UNKNOWN_ATTRIBUTES,
     MessageClass,
     StunMessage,
@@ -217,7 +217,7 @@ def test_an_attribute_behind_the_fingerprint_is_refused() -> None:
         StunMessage(MessageClass.ERROR, TRANSACTION_ID, error_code=200),
         StunMessage(MessageClass.SUCCESS, TRANSACTION_ID, xor_mapped_address=("host.example", 1)),
         StunMessage(MessageClass.SUCCESS, TRANSACTION_ID, xor_mapped_address=("192.0.2.1", 65536)),
-        StunMessage(MessageClass.ERROR, TRANSACTION_ID, error_code=420, unknown_attributes=(1,) * MAX_MESSAGE_BYTES),
+        StunMessage(MessageClass.ERROR, TRANSACTION_ID, error_code=420, unknown_attributes=(1,) * MAX_STUN_BYTES),
     ],
 )
 def test_what_does_not_fit_the_format_is_not_written(unfit: StunMessage) -> None:

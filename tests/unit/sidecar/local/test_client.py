@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from plr.sidecar.doctor import command, ping_command
-from plr.sidecar.local.client import MAX_LINE_BYTES, LocalClient, LocalError
+from plr.sidecar.local.client import MAX_ANSWER_LINE_BYTES, LocalClient, LocalError
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -78,7 +78,7 @@ def parts(value: Any) -> Callable[[int], Iterator[bytes]]:
 
 STRANGE: dict[str, Callable[[int], Iterator[bytes]]] = {
     "deep": lambda _: iter([b"[" * 200_000 + b"\n"]),
-    "long": lambda _: iter([b'"' + b"x" * (MAX_LINE_BYTES + 1) + b"\n"]),
+    "long": lambda _: iter([b'"' + b"x" * (MAX_ANSWER_LINE_BYTES + 1) + b"\n"]),
     "text": parts("x"),
     "number": parts(7),
     "list": parts([1]),

@@ -16,7 +16,7 @@ import pytest
 from plr.sidecar.local import entrance as entrance_module
 from plr.sidecar.local.client import LocalClient
 from plr.sidecar.local.entrance import Entrance, SocketLock
-from plr.sidecar.local.server import LocalServer, LocalSocketError
+from plr.sidecar.local.server import LocalSocketError, LocalSocketServer
 from tests.unit.sidecar.local.world import NOBODY, Source
 
 if TYPE_CHECKING:
@@ -28,7 +28,7 @@ STARTERS, ROUNDS = 4, 10
 
 
 def _start(path: str, barrier: Barrier, said: Any, done: Event) -> None:
-    server = LocalServer(Path(path), Source())
+    server = LocalSocketServer(Path(path), Source())
     barrier.wait()
     try:
         server.open()
@@ -116,15 +116,15 @@ def test_a_folder_that_others_may_change_is_refused(tmp_path: Path) -> None:
     folder.mkdir()
     folder.chmod(0o777)
     with pytest.raises(LocalSocketError, match=r"everybody may change .*folder: chmod o-w"):
-        LocalServer(folder / "sidecar.sock", Source()).open()
+        LocalSocketServer(folder / "sidecar.sock", Source()).open()
     folder.chmod(0o1777)
-    server = LocalServer(folder / "sidecar.sock", Source())
+    server = LocalSocketServer(folder / "sidecar.sock", Source())
     server.open()
     server.close()
     if os.geteuid() == 0:
         os.chown(folder, NOBODY, -1)
         with pytest.raises(LocalSocketError, match=f"belongs to user {NOBODY}"):
-            LocalServer(folder / "sidecar.sock", Source()).open()
+            LocalSocketServer(folder / "sidecar.sock", Source()).open()
 
 
 @pytest.mark.parametrize("what", ["link", "fifo"])

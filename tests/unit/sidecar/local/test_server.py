@@ -18,7 +18,7 @@ import pytest
 from plr.sidecar.local import server as server_module
 from plr.sidecar.local.client import LocalClient, LocalError
 from plr.sidecar.local.entrance import for_group
-from plr.sidecar.local.server import MAX_OWN, MAX_PINGS_OUT, STATES, LocalServer, LocalSocketError
+from plr.sidecar.local.server import MAX_OWN, MAX_REQUESTED_PINGS, STATES, LocalSocketError, LocalSocketServer
 from tests.unit.sidecar.local.world import NOBODY, PATIENCE_S, ROOT, Source, raw, reachable, wait_until
 
 if TYPE_CHECKING:
@@ -34,8 +34,8 @@ def source() -> Source:
 
 
 @pytest.fixture
-def server(tmp_path: Path, source: Source) -> Iterator[LocalServer]:
-    server = LocalServer(tmp_path / "sidecar.sock", source)
+def server(tmp_path: Path, source: Source) -> Iterator[LocalSocketServer]:
+    server = LocalSocketServer(tmp_path / "sidecar.sock", source)
     source.server = server
     server.open()
     yield server
@@ -44,7 +44,7 @@ def server(tmp_path: Path, source: Source) -> Iterator[LocalServer]:
     assert not server.path.exists()
 
 
-def test_the_state_comes_in_parts(server: LocalServer, source: Source) -> None:
+def test_the_state_comes_in_parts(server: LocalSocketServer, source: Source) -> None:
     source.parts = 500
     with LocalClient(server.path) as client:
         state = client.state()
@@ -53,7 +53,7 @@ def test_the_state_comes_in_parts(server: LocalServer, source: Source) -> None:
     assert source.threads == {"plr-local"}
 
 
-def test_a_ping_is_answered_path_by_path(server: LocalServer) -> None:
+def test_a_ping_is_answered_path_by_path(server: LocalSocketServer) -> None:
     with LocalClient(server.path) as client:
         mine = client.ping("cloud-1", None, 64)
         lines = []
@@ -69,7 +69,7 @@ def test_a_ping_is_answered_path_by_path(server: LocalServer) -> None:
     assert {line["value"]["rtt_s"] for line in lines[1:]} == {0.012}
 
 
-def test_a_ping_to_nobody_is_an_error(server: LocalServer) -> None:
+def test_a_ping_to_nobody_is_an_error(server: LocalSocketServer) -> None:
     with LocalClient(server.path) as client:
         client.ping("cloud-9", None, 64)
         line = client.next_line(PATIENCE_S)
@@ -77,13 +77,13 @@ def test_a_ping_to_nobody_is_an_error(server: LocalServer) -> None:
         assert "no path to cloud-9" in line["error"]
 
 
-def test_only_owner_root_and_group_may_open_it(server: LocalServer) -> None:
+def test_only_owner_root_and_group_may_open_it(server: LocalSocketServer) -> None:
     assert stat.S_IMODE(server.path.stat().st_mode) == 0o600
     assert for_group(server.path).exists() is (server._group is not None)
 
 
 @pytest.mark.skipif(os.geteuid() != 0, reason="becoming another user takes root")
-def test_another_user_is_refused_even_where_the_socket_is_open_to_all(server: LocalServer) -> None:
+def test_another_user_is_refused_even_where_the_socket_is_open_to_all(server: LocalSocketServer) -> None:
     for folder in reachable(server.path.parent):
         folder.chmod(0o755)
     script = f"""
@@ -112,7 +112,7 @@ def test_a_member_of_the_group_may_ask_and_others_may_not(
     monkeypatch.setattr(server_module, "GROUP", group.gr_name)
     for folder in reachable(tmp_path):
         folder.chmod(0o755)
-    server = LocalServer(tmp_path / "sidecar.sock", source)
+    server = LocalSocketServer(tmp_path / "sidecar.sock", source)
     server.open()
     try:
         status = for_group(server.path).stat()
@@ -141,7 +141,7 @@ except LocalError as error:
      b'{"id":1,"ask":"ping","peer":"a","size":64,"interface":"' + b"x" * 99 + b'"}\n',
      b"[" * 900 + b"\n", b"x" * 100_000, bytes(range(256)) + b"\n", b"\xff\xfe\n"],
 )  # fmt: skip
-def test_garbage_ends_its_connection_and_no_other(server: LocalServer, garbage: bytes) -> None:
+def test_garbage_ends_its_connection_and_no_other(server: LocalSocketServer, garbage: bytes) -> None:
     with LocalClient(server.path) as good, raw(server) as bad:
         with contextlib.suppress(BrokenPipeError, ConnectionResetError):
             bad.sendall(garbage)
@@ -154,7 +154,7 @@ def test_garbage_ends_its_connection_and_no_other(server: LocalServer, garbage: 
     assert server.refused["bad_request"] == 1
 
 
-def test_half_a_request_is_not_waited_for_long(server: LocalServer, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_half_a_request_is_not_waited_for_long(server: LocalSocketServer, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(server_module, "PATIENCE_S", 0.2)
     monkeypatch.setattr(server_module, "LOOK_S", 0.05)
     with raw(server) as half:
@@ -163,7 +163,7 @@ def test_half_a_request_is_not_waited_for_long(server: LocalServer, monkeypatch:
     assert server.refused["too_slow"] == 1
 
 
-def test_who_says_nothing_is_let_go(server: LocalServer, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_who_says_nothing_is_let_go(server: LocalSocketServer, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(server_module, "IDLE_S", 0.2)
     monkeypatch.setattr(server_module, "LOOK_S", 0.05)
     with raw(server) as silent:
@@ -171,7 +171,7 @@ def test_who_says_nothing_is_let_go(server: LocalServer, monkeypatch: pytest.Mon
 
 
 def test_who_does_not_read_costs_a_buffer_and_is_let_go(
-    server: LocalServer, source: Source, monkeypatch: pytest.MonkeyPatch
+    server: LocalSocketServer, source: Source, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(server_module, "PATIENCE_S", 0.5)
     monkeypatch.setattr(server_module, "LOOK_S", 0.05)
@@ -186,7 +186,7 @@ def test_who_does_not_read_costs_a_buffer_and_is_let_go(
         assert client.state()["node"]
 
 
-def test_of_a_thousand_connections_few_are_taken_and_none_stays(server: LocalServer) -> None:
+def test_of_a_thousand_connections_few_are_taken_and_none_stays(server: LocalSocketServer) -> None:
     socks: list[socket.socket] = []
     try:
         for _ in range(1000):
@@ -214,7 +214,7 @@ def test_of_a_thousand_connections_few_are_taken_and_none_stays(server: LocalSer
 @pytest.mark.parametrize("end", [b"\n", b""])
 @pytest.mark.parametrize("ask", ["state", "ping"])
 def test_who_has_nothing_more_to_ask_is_answered_all_the_same(
-    server: LocalServer, source: Source, ask: str, end: bytes
+    server: LocalSocketServer, source: Source, ask: str, end: bytes
 ) -> None:
     """As `echo ... | nc -N -U` and socat do."""
     source.parts = 300
@@ -231,7 +231,7 @@ def test_who_has_nothing_more_to_ask_is_answered_all_the_same(
 
 
 def test_who_waits_for_pongs_and_goes_is_let_go(
-    server: LocalServer, source: Source, monkeypatch: pytest.MonkeyPatch
+    server: LocalSocketServer, source: Source, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(server_module, "LOOK_S", 0.05)
     source.mute = True
@@ -244,7 +244,7 @@ def test_who_waits_for_pongs_and_goes_is_let_go(
     assert not server._out
 
 
-def test_too_many_requests_are_refused(server: LocalServer) -> None:
+def test_too_many_requests_are_refused(server: LocalSocketServer) -> None:
     with raw(server) as greedy, greedy.makefile("rb") as lines:
         errors = 0
         for number in range(int(STATES.owner.at_once) + 2):
@@ -257,7 +257,7 @@ def test_too_many_requests_are_refused(server: LocalServer) -> None:
     assert server.refused["too_often"] == errors
 
 
-def test_who_asks_without_end_takes_little_time(server: LocalServer) -> None:
+def test_who_asks_without_end_takes_little_time(server: LocalSocketServer) -> None:
     """Each refusal takes time of the interpreter, which the data plane needs."""
     began = time.monotonic()
     with raw(server) as greedy:
@@ -275,18 +275,18 @@ def test_who_asks_without_end_takes_little_time(server: LocalServer) -> None:
             answer = answer[-100:] + greedy.recv(65_536)
 
 
-def test_pings_that_are_out_are_bounded_and_forgotten(server: LocalServer, source: Source) -> None:
+def test_pings_that_are_out_are_bounded_and_forgotten(server: LocalSocketServer, source: Source) -> None:
     source.mute = True
     with raw(server) as greedy:
         asked = [{"id": number, "ask": "ping", "peer": "cloud-1", "size": 64} for number in range(200)]
         greedy.sendall(b"".join(json.dumps(one).encode() + b"\n" for one in asked))
         wait_until(lambda: server.refused["too_often"] > 0)
-        assert len(server._out) <= MAX_PINGS_OUT
+        assert len(server._out) <= MAX_REQUESTED_PINGS
     wait_until(lambda: not server._clients)
     assert not server._out
 
 
-def test_a_ping_nobody_answers_ends(server: LocalServer, source: Source, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_ping_nobody_answers_ends(server: LocalSocketServer, source: Source, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(server_module, "PONG_WAIT_S", 0.1)
     monkeypatch.setattr(server_module, "LOOK_S", 0.05)
     source.mute = True
@@ -298,7 +298,7 @@ def test_a_ping_nobody_answers_ends(server: LocalServer, source: Source, monkeyp
 
 
 def test_a_source_that_fails_costs_its_client_only(
-    server: LocalServer, source: Source, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+    server: LocalSocketServer, source: Source, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     def failing() -> Iterator[tuple[str, Any]]:
         yield "node", {}
@@ -317,15 +317,15 @@ def test_the_socket_of_a_killed_run_is_taken_over(tmp_path: Path, source: Source
     path = tmp_path / "sidecar.sock"
     with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as left:
         left.bind(str(path))
-    server = LocalServer(path, source)
+    server = LocalSocketServer(path, source)
     server.open()
     server.close()
 
 
 def test_the_socket_of_another_sidecar_and_other_files_are_left_alone(
-    server: LocalServer, source: Source, tmp_path: Path
+    server: LocalSocketServer, source: Source, tmp_path: Path
 ) -> None:
-    second = LocalServer(server.path, source)
+    second = LocalSocketServer(server.path, source)
     with pytest.raises(LocalSocketError, match="another sidecar listens"):
         second.open()
     second.close()
@@ -334,10 +334,10 @@ def test_the_socket_of_another_sidecar_and_other_files_are_left_alone(
     other = tmp_path / "file"
     other.write_text("precious")
     with pytest.raises(LocalSocketError, match="something other"):
-        LocalServer(other, source).open()
+        LocalSocketServer(other, source).open()
     assert other.read_text() == "precious"
 
 
 def test_without_its_folder_it_says_why(tmp_path: Path, source: Source) -> None:
     with pytest.raises(LocalSocketError, match="No such file"):
-        LocalServer(tmp_path / "none" / "sidecar.sock", source).open()
+        LocalSocketServer(tmp_path / "none" / "sidecar.sock", source).open()

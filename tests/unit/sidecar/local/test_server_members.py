@@ -14,7 +14,7 @@ import pytest
 from plr.sidecar.local import server as server_module
 from plr.sidecar.local.client import LocalBusyError, LocalClient, LocalError
 from plr.sidecar.local.entrance import for_group
-from plr.sidecar.local.server import MAX_OF_A_USER, MAX_OWN, LocalServer
+from plr.sidecar.local.server import MAX_OF_A_USER, MAX_OWN, LocalSocketServer
 from tests.unit.sidecar.local.world import NOBODY, PATIENCE_S, Source, as_user, raw, wait_until
 
 if TYPE_CHECKING:
@@ -84,9 +84,9 @@ def folder() -> Iterator[Path]:
 
 
 @pytest.fixture
-def server(folder: Path, source: Source, monkeypatch: pytest.MonkeyPatch) -> Iterator[LocalServer]:
+def server(folder: Path, source: Source, monkeypatch: pytest.MonkeyPatch) -> Iterator[LocalSocketServer]:
     monkeypatch.setattr(server_module, "GROUP", GROUP.gr_name)
-    server = LocalServer(folder / "sidecar.sock", source)
+    server = LocalSocketServer(folder / "sidecar.sock", source)
     source.server = server
     server.open()
     yield server
@@ -94,7 +94,7 @@ def server(folder: Path, source: Source, monkeypatch: pytest.MonkeyPatch) -> Ite
     assert not for_group(server.path).exists()
 
 
-def test_a_member_who_floods_does_not_keep_root_out(server: LocalServer) -> None:
+def test_a_member_who_floods_does_not_keep_root_out(server: LocalSocketServer) -> None:
     path = for_group(server.path)
     with as_user(NOBODY, [GROUP.gr_gid], FLOOD.format(path=str(path))) as flood:
         try:
@@ -108,7 +108,7 @@ def test_a_member_who_floods_does_not_keep_root_out(server: LocalServer) -> None
             flood.kill()
 
 
-def test_a_member_who_holds_his_places_leaves_another_some(server: LocalServer) -> None:
+def test_a_member_who_holds_his_places_leaves_another_some(server: LocalSocketServer) -> None:
     script = HOLD.format(path=str(for_group(server.path)), count=2 * MAX_OF_A_USER)
     with as_user(NOBODY, [GROUP.gr_gid], script) as holder:
         try:
@@ -123,7 +123,7 @@ def test_a_member_who_holds_his_places_leaves_another_some(server: LocalServer) 
             holder.kill()
 
 
-def test_members_who_hold_all_their_places_leave_root_its_own(server: LocalServer) -> None:
+def test_members_who_hold_all_their_places_leave_root_its_own(server: LocalSocketServer) -> None:
     script = HOLD.format(path=str(for_group(server.path)), count=2 * MAX_OF_A_USER)
     users = [as_user(NOBODY - number, [GROUP.gr_gid], script) for number in range(5)]
     try:
@@ -142,7 +142,7 @@ def test_members_who_hold_all_their_places_leave_root_its_own(server: LocalServe
             user.communicate()
 
 
-def test_a_member_who_pings_without_end_leaves_root_its_pings(server: LocalServer) -> None:
+def test_a_member_who_pings_without_end_leaves_root_its_pings(server: LocalSocketServer) -> None:
     with as_user(NOBODY, [GROUP.gr_gid], PING.format(path=str(for_group(server.path)))) as greedy:
         try:
             assert greedy.stdout is not None
@@ -159,7 +159,7 @@ def test_a_member_who_pings_without_end_leaves_root_its_pings(server: LocalServe
             greedy.kill()
 
 
-def test_a_full_house_is_called_busy(server: LocalServer) -> None:
+def test_a_full_house_is_called_busy(server: LocalSocketServer) -> None:
     socks = [raw(server) for _ in range(MAX_OWN)]
     wait_until(lambda: len(server._clients) == MAX_OWN)
     with pytest.raises(LocalBusyError, match="too many clients ask at once"), LocalClient(server.path) as client:
@@ -168,7 +168,7 @@ def test_a_full_house_is_called_busy(server: LocalServer) -> None:
         sock.close()
 
 
-def test_a_queue_that_is_full_is_called_busy(server: LocalServer, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_queue_that_is_full_is_called_busy(server: LocalSocketServer, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("plr.sidecar.local.client.CONNECT_S", 1)
     server._stopping = True
     server._ring()

@@ -17,7 +17,7 @@ from plr.sidecar.core.link.pinging import Pong
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
-    from plr.sidecar.local.server import LocalServer
+    from plr.sidecar.local.server import LocalSocketServer
 
 PATIENCE_S = 20.0
 NOBODY = 65534
@@ -28,7 +28,7 @@ class Source:
     """Answers pings itself, unless it is `mute`."""
 
     def __init__(self) -> None:
-        self.server: LocalServer | None = None
+        self.server: LocalSocketServer | None = None
         self.mute = False
         self.parts = 3
         self.threads: set[str] = set()
@@ -50,7 +50,7 @@ class Source:
             self.server.on_pong(Pong(number, path, 0.012))
 
 
-def raw(server: LocalServer, patience_s: float = PATIENCE_S) -> socket.socket:
+def raw(server: LocalSocketServer, patience_s: float = PATIENCE_S) -> socket.socket:
     sock = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
     sock.settimeout(patience_s)
     try:

@@ -6,7 +6,8 @@ import time
 
 import pytest
 
-from plr.sidecar.net.timerfd import NEVER, Timer
+from plr.sidecar.core.base.timers import NEVER
+from plr.sidecar.net.timerfd import Timer
 
 PATIENCE_S = 20.0
 

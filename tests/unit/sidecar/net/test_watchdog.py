@@ -2,7 +2,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, cast
 
-from plr.sidecar.net.watchdog import HUNG_AFTER_S, LOOK_EVERY_S, Changes, Watchdog
+from plr.sidecar.net.watchdog import HUNG_AFTER_S, LOOK_EVERY_S, ThreadChanges, Watchdog
 
 if TYPE_CHECKING:
     from plr.sidecar.net.interface_thread import InterfaceThread
@@ -32,7 +32,7 @@ class Fixture:
     def threads(self) -> list[InterfaceThread]:
         return [cast("InterfaceThread", fake) for fake in self.fakes]
 
-    def look_until(self, end: float) -> list[Changes]:
+    def look_until(self, end: float) -> list[ThreadChanges]:
         found = []
         while self.now < end:
             self.now += LOOK_EVERY_S
@@ -46,11 +46,11 @@ def test_a_long_turn_is_told_once_and_so_is_its_end() -> None:
     world = Fixture()
     good, bad = world.threads
     world.fakes[1].began = world.now
-    assert world.look_until(105.0) == [Changes([bad], [])]
+    assert world.look_until(105.0) == [ThreadChanges([bad], [])]
     assert world.dog.hangs(bad)
     assert not world.dog.hangs(good)
     world.fakes[1].began = world.now  # the next turn
-    assert world.look_until(world.now + HUNG_AFTER_S / 2) == [Changes([], [bad])]
+    assert world.look_until(world.now + HUNG_AFTER_S / 2) == [ThreadChanges([], [bad])]
     assert not world.dog.hangs(bad)
 
 
@@ -67,7 +67,7 @@ def test_a_machine_that_stalled_blames_no_driver() -> None:
     world.now += 10.0
     assert world.dog.look(world.threads, world.now) is None
     world.fakes[0].began = None
-    assert world.look_until(world.now + LOOK_EVERY_S) == [Changes([world.threads[1]], [])]
+    assert world.look_until(world.now + LOOK_EVERY_S) == [ThreadChanges([world.threads[1]], [])]
 
 
 def test_a_thread_that_was_taken_away_is_forgotten() -> None:
@@ -86,8 +86,8 @@ def test_a_thread_that_does_not_get_to_run_blames_no_driver() -> None:
     world.fakes[0].in_a_call = False
     assert world.look_until(105.0) == []
     world.fakes[0].in_a_call = True
-    assert world.look_until(106.0) == [Changes([world.threads[0]], [])]
+    assert world.look_until(106.0) == [ThreadChanges([world.threads[0]], [])]
     world.fakes[0].in_a_call = False  # back from the driver, and it waits for the interpreter
     assert world.look_until(107.0) == []
     world.fakes[0].began = None
-    assert world.look_until(108.0) == [Changes([], [world.threads[0]])]
+    assert world.look_until(108.0) == [ThreadChanges([], [world.threads[0]])]

@@ -21,8 +21,8 @@ from plr.protos.program import own_folder
 from plr.sidecar.state import store as state_store
 from plr.sidecar.state.file import (
     ControlAddresses,
-    Identity,
     LastGood,
+    SavedIdentity,
     decode_addresses,
     decode_identity,
     decode_last_good,
@@ -97,10 +97,10 @@ def test_the_token_stays_and_the_incarnation_grows_with_every_start(tmp_path: Pa
 
 
 def test_the_incarnation_grows_although_the_clock_went_back(tmp_path: Path) -> None:
-    ahead = Identity(bytes(range(16)), incarnation=int((time.time() + 1e6) * 1000))
+    ahead = SavedIdentity(bytes(range(16)), incarnation=int((time.time() + 1e6) * 1000))
     (tmp_path / IDENTITY_FILE).write_bytes(encode_identity(ahead))
     store = StateStore(tmp_path, OWNER)
-    assert store.identity == Identity(ahead.token, ahead.incarnation + 1)
+    assert store.identity == SavedIdentity(ahead.token, ahead.incarnation + 1)
     store.close()
 
 
@@ -375,7 +375,7 @@ store.close()
 
 def test_contents_come_back_from_their_encoding() -> None:
     assert decode_last_good(encode_last_good(EVERYTHING), OWNER) == EVERYTHING
-    identity = Identity(bytes(range(16)), (1 << 64) - 1)
+    identity = SavedIdentity(bytes(range(16)), (1 << 64) - 1)
     assert decode_identity(encode_identity(identity)) == identity
     known = ControlAddresses(("cp.example:50051",), (("192.0.2.1", 50051), ("::1", 1)))
     assert decode_addresses(encode_addresses(known)) == known
@@ -385,6 +385,6 @@ def test_one_file_is_not_taken_for_the_other() -> None:
     with pytest.raises(DecodeError, match="not a file of this kind"):
         decode_identity(encode_last_good(EVERYTHING))
     with pytest.raises(DecodeError, match="not a file of this kind"):
-        decode_last_good(encode_identity(Identity(bytes(16), 1)), OWNER)
+        decode_last_good(encode_identity(SavedIdentity(bytes(16), 1)), OWNER)
     with pytest.raises(DecodeError, match="not a file of this kind"):
-        decode_addresses(encode_identity(Identity(bytes(16), 1)))
+        decode_addresses(encode_identity(SavedIdentity(bytes(16), 1)))

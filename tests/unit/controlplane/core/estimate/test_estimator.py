@@ -233,7 +233,7 @@ def test_observed_misses(estimator: Estimator) -> None:
 
 def test_tables_are_bounded_and_evictions_counted(estimator: Estimator, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(estimator_module, "MAX_PAIRS_PER_ROBOT", 4)
-    monkeypatch.setattr(network_module, "MAX_PATHS", 4)
+    monkeypatch.setattr(network_module, "MAX_PATHS_PER_ROBOT", 4)
     monkeypatch.setattr(network_module, "MAX_CELLS", 4)
     monkeypatch.setattr(estimator_module, "MAX_OUTCOMES_PER_ROBOT", 4)
     monkeypatch.setattr(compute_module, "MAX_PROCESSING", 4)

@@ -27,7 +27,7 @@ def test_it_is_remembered_by_robot_and_by_server() -> None:
 
 
 def test_who_reached_longest_ago_is_forgotten_first_and_counted(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(module, "MAX_PAIRS", 2)
+    monkeypatch.setattr(module, "MAX_REACHED_PAIRS", 2)
     reached = Reached()
     first, second, third = (NodeName(f"robot-{number}") for number in range(3))
     reached.note(first, A)

@@ -15,7 +15,7 @@ from plr.controlplane.core.formulation.problem_builder import (
     EPSILON_SHARE,
     FEW_ROBOTS,
     LIFT_SHARE,
-    MAX_INTERFACES,
+    MAX_CONSIDERED_INTERFACES,
     ROBOT_PAIRS,
     ROUTINE_PAIRS,
     SLICE_PAIRS,
@@ -450,7 +450,7 @@ def drawn_since(fleet: Fleet, was: dict[BlockKey, Any]) -> set[BlockKey]:
 @pytest.mark.audit("ops-20")
 def test_a_robot_with_much_to_draw_holds_up_no_other_and_all_its_services_get_their_turn() -> None:
     fleet, big = with_a_big_robot(services=12)
-    most = ROBOT_PAIRS + 2 * MAX_INTERFACES + 2 * 4 * KEPT_PAIRS
+    most = ROBOT_PAIRS + 2 * MAX_CONSIDERED_INTERFACES + 2 * 4 * KEPT_PAIRS
     seen: set[BlockKey] = set()
     for _ in range(12):
         # It flaps before each picture, and asks to be drawn before the others.

@@ -8,7 +8,7 @@ import pytest
 
 from plr.controlplane.core.base import member_table
 from plr.controlplane.core.overload.registration_share import RETURN_COST, STARTS_BURST, STARTS_PER_S, RegistrationShare
-from plr.controlplane.core.registry.registry import Admission, Refusal, Registry
+from plr.controlplane.core.registry.registry import AcceptedRegistration, Refusal, Registry
 from plr.protos.model.ids import NodeName, Role
 from tests.support.samples import registration, stream
 
@@ -29,7 +29,7 @@ def admitted(made: Callable[[int], Registration]) -> int:
     refused = [one for one in found if isinstance(one, Refusal)]
     assert set(refused) <= {Refusal.TOO_OFTEN}
     assert registry.counters.refused[Refusal.TOO_OFTEN] == len(refused)
-    return sum(isinstance(one, Admission) for one in found)
+    return sum(isinstance(one, AcceptedRegistration) for one in found)
 
 
 def test_a_member_that_starts_all_the_time_is_let_in_as_often_as_its_share() -> None:
@@ -46,12 +46,12 @@ def test_a_run_that_only_connects_again_is_let_in_once_a_second() -> None:
 
 def test_the_share_of_one_is_not_anothers_and_a_stranger_takes_none_of_it() -> None:
     registry = Registry(lease_s=1e6)
-    assert isinstance(registry.register(registration("robot"), stream(1), 0.0), Admission)
+    assert isinstance(registry.register(registration("robot"), stream(1), 0.0), AcceptedRegistration)
     for number in range(200):
         thief = registration("robot", token=b"another sidecar!", incarnation=9 + number)
         assert registry.register(thief, stream(2), 0.0) is Refusal.NAME_TAKEN
         registry.register(registration("other", incarnation=number, token=b"t" * 16), stream(2), 0.0)
-    assert isinstance(registry.register(registration("robot", incarnation=2), stream(3), 0.0), Admission)
+    assert isinstance(registry.register(registration("robot", incarnation=2), stream(3), 0.0), AcceptedRegistration)
 
 
 def test_who_registered_longest_ago_is_forgotten_first(monkeypatch: pytest.MonkeyPatch) -> None:

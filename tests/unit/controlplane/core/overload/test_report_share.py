@@ -19,7 +19,7 @@ from plr.controlplane.core.overload.report_share import (
 )
 from plr.protos.convert.fields import MAX_OUTCOMES
 from plr.protos.model.ids import NodeName
-from plr.protos.model.report import MAX_GOODBYES, MAX_JOINTS, MAX_LATENCIES, MAX_PATHS, MAX_PENALTIES
+from plr.protos.model.report import MAX_GOODBYES, MAX_JOINTS, MAX_LATENCIES, MAX_PATH_REPORTS, MAX_PENALTIES
 
 ROBOT = NodeName("robot")
 ENTRY_S = 40e-6
@@ -128,7 +128,7 @@ def test_reports_of_a_large_robot_are_read_at_once_and_of_more_at_a_bearable_pac
     shares = ReportShares()
     large = 8 * 16 * (4 + 1)
     assert not any(shares.take(ROBOT, large, second / 2) for second in range(100)), "8 interfaces, 16 servers"
-    largest = MAX_LATENCIES + MAX_PATHS + MAX_OUTCOMES + 2 * MAX_JOINTS + MAX_PENALTIES + MAX_GOODBYES
+    largest = MAX_LATENCIES + MAX_PATH_REPORTS + MAX_OUTCOMES + 2 * MAX_JOINTS + MAX_PENALTIES + MAX_GOODBYES
     assert not shares.take(ROBOT, largest, 60.0), "the largest there is"
     now, entries = 100.0, 0
     while now < 200.0:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from plr.controlplane.core.policy.explain import MAX_CLOSE, explain
+from plr.controlplane.core.policy.explain import MAX_NAMED_RULES, explain
 from plr.controlplane.core.policy.policy import CallRule, OfferRule, Policy
 from plr.protos.model.ids import NodeName, ServiceName
 from plr.protos.model.members import NO_POLICY, POLICY_PENDING
@@ -77,7 +77,7 @@ def test_a_denied_call_names_the_rule_that_is_missing_and_those_that_come_close(
 
 def test_only_a_few_close_rules_are_named() -> None:
     many = Policy((CallRule(("*",), ("/other",), ("*",)),) * 100, POLICY.offers)
-    assert len(explain(many, ARM, GRIP, A).reasons) == 2 + MAX_CLOSE
+    assert len(explain(many, ARM, GRIP, A).reasons) == 2 + MAX_NAMED_RULES
 
 
 def test_the_missing_rules_it_names_are_the_ones() -> None:

@@ -7,7 +7,7 @@ import math
 import pytest
 
 from plr.controlplane.core.problem.costs import RULE_PRICE
-from plr.controlplane.core.problem.plan import Plan, Price, choice_of, make_plan, price, relative_gap, size
+from plr.controlplane.core.problem.plan import Plan, PlanCost, choice_of, make_plan, price, relative_gap, size
 from plr.controlplane.core.problem.problem import Objective, Problem
 from tests.unit.controlplane.problems import block
 
@@ -15,8 +15,8 @@ from tests.unit.controlplane.problems import block
 def test_price_puts_capacity_before_misses() -> None:
     part = block([[0.1, 0.9], [0.1, 0.9]])
     problem = Problem((part,), objective=Objective.SUM)
-    assert price(problem, {part.key: (0, 0)}) == Price(1, 0.1 + 0.1)
-    assert price(problem, {part.key: (0, 1)}) == Price(0, 0.1 + 0.9)
+    assert price(problem, {part.key: (0, 0)}) == PlanCost(1, 0.1 + 0.1)
+    assert price(problem, {part.key: (0, 1)}) == PlanCost(0, 0.1 + 0.9)
     assert price(problem, {part.key: (0, 1)}) < price(problem, {part.key: (0, 0)})
 
 

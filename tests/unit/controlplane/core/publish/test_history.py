@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 from plr.controlplane.core.problem.problem import BlockKey
 from plr.controlplane.core.publish import history as mapping_history
-from plr.controlplane.core.publish.history import MAX_CHANGES, MappingHistory
+from plr.controlplane.core.publish.history import MAX_REMEMBERED_CHANGES, MappingHistory
 from plr.protos.model.ids import InterfaceName, NodeName, Version
 from plr.protos.model.mapping import Assignment, MappingSet, ServiceMapping
 from tests.support.samples import PLAN
@@ -39,11 +39,11 @@ def test_a_change_is_remembered_and_mere_news_of_the_prediction_is_not() -> None
 def test_old_changes_and_old_histories_go(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(mapping_history, "MAX_HISTORIES", 2)
     history = MappingHistory()
-    for version in range(1, MAX_CHANGES + 5):
+    for version in range(1, MAX_REMEMBERED_CHANGES + 5):
         history.note(ROBOT, sent(version, f"cloud-{version}"), float(version))
     found = history.of(KEY)
     assert found is not None
-    assert len(found.changes) == MAX_CHANGES
+    assert len(found.changes) == MAX_REMEMBERED_CHANGES
     history.note(NodeName("second"), sent(1, "a"), 50.0)
     history.note(ROBOT, sent(99, "a"), 51.0)
     history.note(NodeName("third"), sent(1, "a"), 52.0)

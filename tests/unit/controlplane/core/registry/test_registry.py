@@ -8,7 +8,7 @@ import pytest
 
 from plr.controlplane.core.overload.postponed import COUNTED_BURST
 from plr.controlplane.core.registry import registry as registry_module
-from plr.controlplane.core.registry.registry import MAX_POSTPONED, POSTPONE_S, Admission, Refusal, Registry
+from plr.controlplane.core.registry.registry import MAX_POSTPONED, POSTPONE_S, AcceptedRegistration, Refusal, Registry
 from plr.protos.model.ids import NodeName, Role
 from plr.protos.model.members import CandidateSet, RemovalReason, ServiceSet
 from tests.support.samples import interfaces, offer, registration, stream
@@ -25,7 +25,7 @@ def registry() -> Registry:
 
 
 def test_a_silent_sidecar_disappears_when_its_lease_ends(registry: Registry) -> None:
-    assert registry.register(registration("robot"), stream(1), 0.0) == Admission(None, new_run=True)
+    assert registry.register(registration("robot"), stream(1), 0.0) == AcceptedRegistration(None, new_run=True)
     assert registry.next_expiry() == LEASE_S
     assert registry.expire(LEASE_S - 0.01) == []
     assert [gone.name for gone in registry.expire(LEASE_S)] == [ROBOT]
@@ -51,7 +51,7 @@ def test_losing_the_stream_keeps_the_sidecar_until_its_lease_ends(registry: Regi
     known = registry.get(ROBOT)
     assert known is not None
     assert known.stream is None
-    assert registry.register(registration("robot"), stream(2), 1.0) == Admission(None, new_run=False)
+    assert registry.register(registration("robot"), stream(2), 1.0) == AcceptedRegistration(None, new_run=False)
     again = registry.get(ROBOT)
     assert again is not None
     assert again.candidates == interfaces("wlan0")
@@ -91,7 +91,7 @@ def test_a_newer_incarnation_replaces_the_older_stream(registry: Registry) -> No
     registry.set_candidates(ROBOT, CandidateSet(interfaces("wlan0")))
     registry.set_draining(ROBOT)
     result = registry.register(registration("robot", incarnation=2), stream(2), 1.0)
-    assert result == Admission(replaced=stream(1), new_run=True)
+    assert result == AcceptedRegistration(replaced=stream(1), new_run=True)
     known = registry.get(ROBOT)
     assert known is not None
     # Its peers keep its addresses until it tells new ones, but know its new session at once.
@@ -109,9 +109,9 @@ def test_a_session_number_belongs_to_one_sidecar(registry: Registry) -> None:
     registry.register(registration("one", session=7), stream(1), 0.0)
     assert registry.register(registration("two", session=7), stream(2), 0.0) is Refusal.SESSION_TAKEN
     registry.register(registration("one", session=8, incarnation=2), stream(3), 0.0)
-    assert isinstance(registry.register(registration("two", session=7), stream(2), 0.0), Admission)
+    assert isinstance(registry.register(registration("two", session=7), stream(2), 0.0), AcceptedRegistration)
     registry.expire(LEASE_S)
-    assert isinstance(registry.register(registration("three", session=8), stream(4), LEASE_S), Admission)
+    assert isinstance(registry.register(registration("three", session=8), stream(4), LEASE_S), AcceptedRegistration)
 
 
 def test_a_sidecar_is_ready_when_it_told_addresses_and_services(registry: Registry) -> None:
@@ -138,7 +138,7 @@ def test_a_name_belongs_to_its_token_while_the_lease_lasts(registry: Registry) -
     twin = registration("robot", session=99)
     assert registry.register(twin, stream(2), 1.0) is Refusal.NAME_TAKEN
     registry.expire(LEASE_S)
-    assert isinstance(registry.register(stranger, stream(2), LEASE_S), Admission)
+    assert isinstance(registry.register(stranger, stream(2), LEASE_S), AcceptedRegistration)
 
 
 def test_a_full_registry_refuses_newcomers_and_keeps_the_known(
@@ -148,7 +148,7 @@ def test_a_full_registry_refuses_newcomers_and_keeps_the_known(
     registry.register(registration("a"), stream(1), 0.0)
     registry.register(registration("b"), stream(2), 0.0)
     assert registry.register(registration("c"), stream(3), 0.0) is Refusal.FULL
-    assert isinstance(registry.register(registration("b", incarnation=2), stream(4), 0.0), Admission)
+    assert isinstance(registry.register(registration("b", incarnation=2), stream(4), 0.0), AcceptedRegistration)
     assert {sidecar.name for sidecar in registry} == {"a", "b"}
     assert registry.counters.refused[Refusal.FULL] == 1
 

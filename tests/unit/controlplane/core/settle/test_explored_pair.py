@@ -10,7 +10,7 @@ import pytest
 
 from plr.controlplane.core.problem.plan import BlockPlan, Plan, make_plan
 from plr.controlplane.core.problem.problem import Block, Choice, Problem
-from plr.controlplane.core.settle.explored_pair import TRIALS, Exploration, knowledge_gradient, most_instructive
+from plr.controlplane.core.settle.explored_pair import TRIALS, ExploredPairs, knowledge_gradient, most_instructive
 from plr.protos.model.ids import InterfaceName, NodeName
 from plr.protos.model.mapping import Assignment
 from tests.unit.controlplane.problems import block
@@ -76,7 +76,7 @@ def test_the_gain_is_what_trials_bring_on_average(rival: float, mean: float, wei
 
 def test_what_did_not_change_is_not_looked_at_again() -> None:
     part = known([[0.2, 0.5]], [[1.0, 1.0]])
-    exploration, plan = Exploration(), Plan({part.key: planned(part, (0,))})
+    exploration, plan = ExploredPairs(), Plan({part.key: planned(part, (0,))})
     assert exploration.update(Problem((part,)), plan) == {part.key: pair(0, 1)}
     assert exploration.update(Problem((part,)), plan) == {part.key: pair(0, 1)}
     moved = Plan({part.key: planned(part, (1,))})

@@ -9,7 +9,7 @@ import pytest
 
 from plr.controlplane.core.problem.plan import Plan, make_plan, price
 from plr.controlplane.core.problem.problem import FleetKey, Objective, Problem, Target
-from plr.controlplane.core.settle.stability import CHANGE_WINDOW_S, MAX_CHANGES, Stability
+from plr.controlplane.core.settle.stability import CHANGE_WINDOW_S, MAX_MOVES, Stability
 from plr.controlplane.solver.matcher import solve
 from plr.protos.model.ids import NodeName
 from plr.protos.model.members import AT_MOST_EVERY_INTERFACE
@@ -193,10 +193,10 @@ def test_a_robot_moves_to_something_better_only_so_often_in_a_minute() -> None:
         if settled.blocks[sides[0].key].assignments != plan.blocks[sides[0].key].assignments:
             moves.append(second)
         plan = settled
-    assert moves[:MAX_CHANGES] == list(range(MAX_CHANGES))
+    assert moves[:MAX_MOVES] == list(range(MAX_MOVES))
     for start in moves:
-        assert sum(start <= move < start + CHANGE_WINDOW_S for move in moves) <= MAX_CHANGES
-    assert len(moves) == MAX_CHANGES * 5
+        assert sum(start <= move < start + CHANGE_WINDOW_S for move in moves) <= MAX_MOVES
+    assert len(moves) == MAX_MOVES * 5
 
 
 def test_no_number_of_changes_keeps_a_robot_where_all_copies_miss() -> None:

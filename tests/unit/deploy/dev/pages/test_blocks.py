@@ -6,7 +6,10 @@ import pytest
 
 from deploy.dev.pages.blocks import replace_blocks
 
-PAGE = "before\n\n<!-- generated: a -->\nold\n<!-- end of generated -->\n\nbetween\n\n<!-- generated: b -->\n<!-- end of generated -->\nafter\n"
+PAGE = (
+    "before\n\n<!-- generated: a -->\nold\n<!-- end of generated -->\n\nbetween\n\n"
+    "<!-- generated: b -->\n<!-- end of generated -->\nafter\n"
+)
 
 
 def test_the_text_around_blocks_stays() -> None:

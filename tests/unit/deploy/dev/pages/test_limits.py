@@ -39,7 +39,7 @@ def test_a_constant_that_moved_is_found() -> None:
     ("limit", "source", "problem"),
     [
         ("1", "`protos/model/members.py` `MAX_NOTHING`", "found it in: none"),
-        ("1", "`protos/old/gone.py` `MAX_PATHS`", "the file that defines MAX_PATHS"),
+        ("1", "`protos/old/gone.py` `RETRY_S`", "the file that defines RETRY_S"),
         ("1", "`protos/old/gone.py`", "expected a file"),
         ("many", "`protos/model/members.py` `MAX_PEERS`", "a figure for each of 1"),
     ],

@@ -11,7 +11,7 @@ from plr.sidecar.core.base.slices import SLICE, Backlog
 from plr.sidecar.core.base.values import PathState, Priority, RejectReason
 from plr.sidecar.core.cloud import answers as answers_module
 from plr.sidecar.core.cloud.answers import Answers
-from plr.sidecar.core.cloud.executions import Reply, Waiter
+from plr.sidecar.core.cloud.executions import Reply, ReplyTo
 from plr.sidecar.core.rules.service_rule import Rules
 from plr.sidecar.core.seam.links import LinkCommand, Send
 from plr.sidecar.core.seam.stats import EngineStats
@@ -49,7 +49,7 @@ class Cloud:
     ) -> None:
         replies = [
             Reply(
-                Waiter(way, copy),
+                ReplyTo(way, copy),
                 ECHO,
                 ResponseMessage(request_id(number), copy, 0.01, bytes(size)),
                 Priority.NORMAL,
@@ -137,7 +137,7 @@ def test_a_copy_that_asks_twice_gets_one_answer_also_when_the_kept_one_is_gone()
     for number in (1, 4):  # under way, waiting
         cloud.answer(number, LARGE)
         forgotten = RejectionMessage(request_id(number), 0, RejectReason.FORGOTTEN, "")
-        cloud.answers.send([Reply(Waiter(WWAN, 0), ECHO, forgotten, Priority.NORMAL, 5.0, 10.0)], 0.0)
+        cloud.answers.send([Reply(ReplyTo(WWAN, 0), ECHO, forgotten, Priority.NORMAL, 5.0, 10.0)], 0.0)
     assert cloud.sent() == []
     cloud.finish(1)
     assert cloud.sent() == [(4, 0, WLAN)]
@@ -182,7 +182,7 @@ def test_a_rejection_does_not_stand_for_an_answer_that_comes_later() -> None:
     cloud = Cloud()
     refused = RejectionMessage(request_id(1), 0, RejectReason.OVERLOADED, "")
     for _ in range(2):
-        cloud.answers.send([Reply(Waiter(WLAN, 0), ECHO, refused, Priority.NORMAL, 5.0, 10.0)], 0.0)
+        cloud.answers.send([Reply(ReplyTo(WLAN, 0), ECHO, refused, Priority.NORMAL, 5.0, 10.0)], 0.0)
     cloud.answer(1, 10, WWAN, first_copy=1)
     assert cloud.sent() == [(1, 0, WLAN), (1, 1, WWAN)]
     cloud.answers.drop(ROBOT, request_id(1))

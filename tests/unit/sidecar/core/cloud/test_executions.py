@@ -18,7 +18,7 @@ from plr.sidecar.core.cloud.executions import (
     TIMER_SLACK,
     ExecutionTable,
     Reply,
-    Waiter,
+    ReplyTo,
 )
 from plr.sidecar.core.rules.service_rule import MAX_LIFETIME_S
 from plr.sidecar.core.seam.application import AbandonExecution, CancelExecution, ExecuteRequest
@@ -48,9 +48,9 @@ def test_copies_of_a_running_request_wait_and_all_get_the_answer() -> None:
     assert executions.on_request(ROBOT_2ND, request(copy=1), 1.1) is None
     assert executions.on_request(ROBOT_2ND, request(copy=1), 1.2) is None, "a duplicate"
     replies = executions.complete(execution.execution, b"answer", 0.05, 1.3)
-    assert [reply.waiter for reply in replies] == [Waiter(ROBOT, 0), Waiter(ROBOT_2ND, 1)]
+    assert [reply.to for reply in replies] == [ReplyTo(ROBOT, 0), ReplyTo(ROBOT_2ND, 1)]
     for reply in replies:
-        assert reply.message == ResponseMessage(request().request_id, reply.waiter.copy, 0.05, b"answer")
+        assert reply.message == ResponseMessage(request().request_id, reply.to.copy, 0.05, b"answer")
     stats = executions._stats.executions
     assert (stats[ECHO, "run"], stats[ECHO, "coalesced"]) == (1, 2)
 
@@ -176,7 +176,7 @@ def test_who_sends_the_id_of_anothers_request_first_takes_nothing_from_it() -> N
     mine = run(executions, request(1), 1.1)
     run(executions, request(2), 1.1)
     (reply,) = executions.complete(mine.execution, b"secret", 0.0, 1.2)
-    assert reply.waiter.path == ROBOT
+    assert reply.to.path == ROBOT
     again = executions.on_request(OTHER, request(1, service=ServiceName("/else"), copy=1), 1.3)
     assert again is None, "nor does the cache tell others"
 
@@ -284,7 +284,7 @@ def test_a_full_table_refuses_one_robot_and_still_serves_another() -> None:
 
 
 def test_remembered_ids_are_capped_per_robot(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(dedup, "MAX_REMEMBERED", 20)
+    monkeypatch.setattr(dedup, "MAX_REMEMBERED_IDS", 20)
     executions = table()
     for number in range(10):
         executions.complete(run(executions, request(number)).execution, b"", 0.0, 1.0)
@@ -322,7 +322,7 @@ def test_unknown_services_make_no_counters() -> None:
     executions = table()
     for number in range(100):
         message = request(number, service=ServiceName(f"/made/up/{number}"))
-        executions.refuse_unseen(Waiter(ROBOT, 0), message, RejectReason.NOT_OFFERED, "", 1.0)
+        executions.refuse_unseen(ReplyTo(ROBOT, 0), message, RejectReason.NOT_OFFERED, "", 1.0)
     assert not executions._stats.executions
     assert executions._stats.dropped["request_for_unknown_service"] == 100
 

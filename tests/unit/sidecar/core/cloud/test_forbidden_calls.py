@@ -7,7 +7,7 @@ from plr.protos.model.members import Peer, ServiceOffer
 from plr.sidecar.core.base.slices import Backlog
 from plr.sidecar.core.base.values import PathState, RejectReason
 from plr.sidecar.core.cloud.cloud_role import CloudRole
-from plr.sidecar.core.cloud.forbidden_calls import MAX_ROBOTS, TELL_EVERY_S, ForbiddenCalls
+from plr.sidecar.core.cloud.forbidden_calls import MAX_FORBIDDEN_ROBOTS, TELL_EVERY_S, ForbiddenCalls
 from plr.sidecar.core.rules.service_rule import Rules
 from plr.sidecar.core.seam.application import ApplicationEvent, CallsForbidden, ExecuteRequest
 from plr.sidecar.core.seam.links import PathCommand, Send
@@ -155,6 +155,6 @@ def test_notices_are_rare_and_count_what_was_not_told() -> None:
 
 def test_the_robots_noted_are_bounded() -> None:
     forbidden = ForbiddenCalls()
-    for number in range(2 * MAX_ROBOTS):
+    for number in range(2 * MAX_FORBIDDEN_ROBOTS):
         forbidden.note(NodeName(f"r{number}"), ECHO, 1.0)
-    assert len(forbidden._robots) == MAX_ROBOTS
+    assert len(forbidden._robots) == MAX_FORBIDDEN_ROBOTS

@@ -7,7 +7,7 @@ import pytest
 from plr.protos.model.ids import NodeName
 from plr.sidecar.core.base.values import RejectReason
 from plr.sidecar.core.cloud import refused_copies
-from plr.sidecar.core.cloud.executions import MIN_REMEMBER_S, Reply, Waiter
+from plr.sidecar.core.cloud.executions import MIN_REMEMBER_S, Reply, ReplyTo
 from plr.sidecar.core.cloud.refused_copies import RefusedCopies, RefusedCopy
 from plr.sidecar.core.seam.stats import EngineStats
 from plr.sidecar.core.wire.messages import RejectionMessage
@@ -25,11 +25,11 @@ def test_a_copy_that_was_refused_does_not_run_later_and_another_one_does(by_appl
         replies = executions.refuse(execution.execution, RejectReason.OVERLOADED, "too much", 1.0)
     else:
         replies = [
-            executions.refuse_unseen(Waiter(ROBOT, copy), request(copy=copy), RejectReason.OVERLOADED, "too much", 1.0)
+            executions.refuse_unseen(ReplyTo(ROBOT, copy), request(copy=copy), RejectReason.OVERLOADED, "too much", 1.0)
             for copy in (0, 1)
         ]
     for reply in replies:
-        again = executions.on_request(ROBOT_2ND, request(copy=reply.waiter.copy), 2.0)
+        again = executions.on_request(ROBOT_2ND, request(copy=reply.to.copy), 2.0)
         assert isinstance(again, Reply)
         assert again.message == reply.message
         assert isinstance(again.message, RejectionMessage)
@@ -38,8 +38,8 @@ def test_a_copy_that_was_refused_does_not_run_later_and_another_one_does(by_appl
 
 def test_they_are_forgotten_when_they_cannot_come_any_more() -> None:
     executions = table()
-    executions.refuse_unseen(Waiter(ROBOT, 0), request(lifetime_s=200.0), RejectReason.DRAINING, "", 1.0)
-    executions.refuse_unseen(Waiter(ROBOT, 0), request(2), RejectReason.DRAINING, "", 1.0)
+    executions.refuse_unseen(ReplyTo(ROBOT, 0), request(lifetime_s=200.0), RejectReason.DRAINING, "", 1.0)
+    executions.refuse_unseen(ReplyTo(ROBOT, 0), request(2), RejectReason.DRAINING, "", 1.0)
     run(executions, request(2), 1.0 + MIN_REMEMBER_S)
     assert isinstance(executions.on_request(ROBOT, request(), 200.0), Reply)
 

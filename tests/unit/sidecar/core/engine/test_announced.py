@@ -191,7 +191,7 @@ def test_the_first_eight_of_an_interface_are_used() -> None:
 
 
 def test_the_absent_ones_are_forgotten_first(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(module, "MAX_REMEMBERED", 3)
+    monkeypatch.setattr(module, "MAX_ANNOUNCED_PEERS", 3)
     announced = Announced(INSECURE, Counter())
     for name in ("a", "b", "c", "a", "d"):
         announced.candidates_of(peer(name))

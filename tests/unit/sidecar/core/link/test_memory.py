@@ -6,7 +6,7 @@ import pytest
 
 from plr.protos.model.ids import InterfaceId, NodeName, Role, SessionId
 from plr.sidecar.core.link import memory as link_memory
-from plr.sidecar.core.link.memory import MAX_PATHS_OF_A_PEER, LinkMemory
+from plr.sidecar.core.link.memory import MAX_REMEMBERED_PATHS_OF_PEER, LinkMemory
 from plr.sidecar.core.path.key_exchange import DEFAULT_LIMITS
 from plr.sidecar.core.path.keys import PathKeys, make_path_keys
 from tests.support.builders import peer
@@ -51,9 +51,9 @@ def test_what_never_opened_anything_is_not_kept() -> None:
 
 def test_a_full_share_forgets_the_oldest_session_whatever_the_order_in_which_they_went() -> None:
     memory = LinkMemory()
-    for number in [*range(MAX_PATHS_OF_A_PEER, 0, -1), MAX_PATHS_OF_A_PEER + 1]:
+    for number in [*range(MAX_REMEMBERED_PATHS_OF_PEER, 0, -1), MAX_REMEMBERED_PATHS_OF_PEER + 1]:
         memory.keep(A, SessionId(number), REMOTE, path_keys(number))
-    assert len(memory) == MAX_PATHS_OF_A_PEER
+    assert len(memory) == MAX_REMEMBERED_PATHS_OF_PEER
     assert memory.take(A, SessionId(1), REMOTE) is None
     assert memory.forgot(A, 1)
     assert not memory.forgot(A, 2)
@@ -61,18 +61,18 @@ def test_a_full_share_forgets_the_oldest_session_whatever_the_order_in_which_the
 
 
 def test_a_full_share_costs_nobody_else() -> None:
-    memory = filled(range(1, 10 * MAX_PATHS_OF_A_PEER))
+    memory = filled(range(1, 10 * MAX_REMEMBERED_PATHS_OF_PEER))
     kept = path_keys()
     memory.keep(B, SessionId(77), REMOTE, kept)
-    for number in range(10 * MAX_PATHS_OF_A_PEER, 20 * MAX_PATHS_OF_A_PEER):
+    for number in range(10 * MAX_REMEMBERED_PATHS_OF_PEER, 20 * MAX_REMEMBERED_PATHS_OF_PEER):
         memory.keep(A, SessionId(number), REMOTE, path_keys(number))
-    assert len(memory) == MAX_PATHS_OF_A_PEER + 1
+    assert len(memory) == MAX_REMEMBERED_PATHS_OF_PEER + 1
     assert memory.take(B, SessionId(77), REMOTE) is kept
     assert not memory.forgot(B, 1)
 
 
 def test_beyond_the_total_whoever_has_most_forgets(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(link_memory, "MAX_PATHS", 20)
+    monkeypatch.setattr(link_memory, "MAX_REMEMBERED_PATHS", 20)
     memory = filled(range(1, 16))
     for number in range(100, 110):
         memory.keep(B, SessionId(number), REMOTE, path_keys(number))
@@ -84,7 +84,7 @@ def test_beyond_the_total_whoever_has_most_forgets(monkeypatch: pytest.MonkeyPat
 
 def test_names_of_the_forgotten_are_capped(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(link_memory, "MAX_FORGOTTEN_PEERS", 2)
-    monkeypatch.setattr(link_memory, "MAX_PATHS_OF_A_PEER", 1)
+    monkeypatch.setattr(link_memory, "MAX_REMEMBERED_PATHS_OF_PEER", 1)
     memory = LinkMemory()
     for name in ("a", "b", "c"):
         for number in (1, 2):
@@ -93,7 +93,7 @@ def test_names_of_the_forgotten_are_capped(monkeypatch: pytest.MonkeyPatch) -> N
 
 
 def test_the_next_link_inherits_copies_and_what_was_forgotten() -> None:
-    memory = filled(range(1, MAX_PATHS_OF_A_PEER + 2))
+    memory = filled(range(1, MAX_REMEMBERED_PATHS_OF_PEER + 2))
     heir = LinkMemory()
     heir.keep_all(memory)
     assert heir.forgot(A, 1)
@@ -107,7 +107,7 @@ def test_the_next_link_inherits_copies_and_what_was_forgotten() -> None:
 def test_whoever_has_a_name_after_one_that_was_revoked_starts_over() -> None:
     """A thief may have used, and left behind, the largest incarnations there are."""
     last = 2**64 - 1
-    memory = filled(range(last - MAX_PATHS_OF_A_PEER, last + 1))
+    memory = filled(range(last - MAX_REMEMBERED_PATHS_OF_PEER, last + 1))
     memory.begin_era(A, 0)
     assert memory.forgot(A, 1)
     memory.keep(B, SessionId(7), REMOTE, path_keys(7))

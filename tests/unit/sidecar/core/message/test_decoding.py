@@ -10,7 +10,7 @@ import pytest
 
 from plr.protos.model.ids import NodeName, SessionId
 from plr.sidecar.core.message import decoding
-from plr.sidecar.core.message.decoding import MAX_BYTES, Decoding, DecodingLine
+from plr.sidecar.core.message.decoding import MAX_DECODING_BYTES, Decoding, DecodingLine
 from plr.sidecar.core.message.partial import SLICE_OPERATIONS, Partial
 from plr.sidecar.core.message.reassembly import Reassembler
 from plr.sidecar.core.message.symbols import MessageSymbols
@@ -139,14 +139,14 @@ def test_one_peer_leaves_room_for_the_others() -> None:
     large = undecoded(2**20, 1100)
     while line.fits(A, large):
         line.add(at(A, large))
-    assert (len(line) - 1) * large.held_bytes <= MAX_BYTES // 2
+    assert (len(line) - 1) * large.held_bytes <= MAX_DECODING_BYTES // 2
     assert line.fits(NodeName("robot"), undecoded(16 * 2**20, 1100))
     line.forget_peer(A)
     assert line.fits(A, large)
 
 
 def test_what_finds_no_room_in_line_is_sent_again_by_its_sender(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(decoding, "MAX_MESSAGES", 4)
+    monkeypatch.setattr(decoding, "MAX_DECODING_MESSAGES", 4)
     told: list[PathCommand] = []
     stats = EngineStats()
     inbound = Inbound(told.append, stats, answers=False)

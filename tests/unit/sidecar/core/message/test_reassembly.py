@@ -8,9 +8,9 @@ import pytest
 
 from plr.sidecar.core.message.partial import Partial
 from plr.sidecar.core.message.reassembly import (
-    MAX_AGE_S,
     MAX_PEER_BYTES,
     MAX_PEER_MESSAGES,
+    MAX_SILENCE_S,
     OVER_REMEMBERED,
     Fate,
     Reassembled,
@@ -220,9 +220,9 @@ def test_symbols_do_not_keep_their_datagram(reassembler: Reassembler) -> None:
 def test_the_old_expire_and_the_others_stay(reassembler: Reassembler, dropped: Counter[str]) -> None:
     announce(reassembler, 1, 1000, now=1.0)
     announce(reassembler, 2, 1000, now=5.0)
-    reassembler.expire(1.0 + MAX_AGE_S - 0.1)
+    reassembler.expire(1.0 + MAX_SILENCE_S - 0.1)
     assert len(reassembler) == 2
-    reassembler.expire(1.0 + MAX_AGE_S)
+    reassembler.expire(1.0 + MAX_SILENCE_S)
     assert len(reassembler) == 1
     assert dropped["reassembly_expired"] == 1
     assert reassembler.held_bytes == 1000
@@ -231,7 +231,7 @@ def test_the_old_expire_and_the_others_stay(reassembler: Reassembler, dropped: C
 def test_what_was_dropped_unfinished_is_said_to_be_forgotten(reassembler: Reassembler) -> None:
     first, *rest = symbols(1, bytes(1000))
     reassembler.add([first], 1.0)
-    reassembler.expire(1.0 + MAX_AGE_S)
+    reassembler.expire(1.0 + MAX_SILENCE_S)
     assert reassembler.add(rest, 40.0) == [Reassembled(1, Fate.FORGOTTEN, None)]
     assert len(reassembler) == 0
 

@@ -7,7 +7,7 @@ import pytest
 from plr.sidecar.core.message.repair import (
     FAILURES,
     FLOOR,
-    MAX_COPIES,
+    MAX_DOUBLED_SYMBOLS,
     MAX_RATIO,
     WORTH_A_COPY,
     Loss,
@@ -46,8 +46,8 @@ def test_few_datagrams_are_doubled_only_where_it_pays() -> None:
     assert not worth_a_copy(1, Loss(0.9 * WORTH_A_COPY))
     assert worth_a_copy(1, Loss(1.01 * WORTH_A_COPY))
     assert worth_a_copy(2, Loss(0.9 * WORTH_A_COPY)), "one of two is lost more often than one of one"
-    assert worth_a_copy(MAX_COPIES, Loss(0.02))
-    assert not worth_a_copy(MAX_COPIES + 1, Loss(0.02))
+    assert worth_a_copy(MAX_DOUBLED_SYMBOLS, Loss(0.02))
+    assert not worth_a_copy(MAX_DOUBLED_SYMBOLS + 1, Loss(0.02))
 
 
 def test_a_lone_datagram_gets_no_repair_symbol_by_the_loss() -> None:

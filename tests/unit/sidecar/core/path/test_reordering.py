@@ -4,7 +4,7 @@ import pytest
 
 from plr.sidecar.core.path.congestion.rtt import LONGEST_ANSWER_S, RttEstimator
 from plr.sidecar.core.path.in_flight import Sent
-from plr.sidecar.core.path.reordering import MAX_REMEMBERED, PACKET_THRESHOLD, PERSISTS, Reordering
+from plr.sidecar.core.path.reordering import MAX_LOST_RUNS, PACKET_THRESHOLD, PERSISTS, Reordering
 from plr.sidecar.core.wire.frame import MAX_ACK_RANGES
 from tests.support.builders import message
 
@@ -85,8 +85,8 @@ def test_parts_of_runs_turn_up_one_after_the_other() -> None:
 def test_what_is_remembered_is_bounded_and_forgotten_in_time() -> None:
     known = Reordering()
     rtt = steady()
-    known.note_lost([run(number) for number in range(10 * MAX_REMEMBERED)], by_threshold=True)
-    assert len(known.late([(0, 10 * MAX_REMEMBERED)], rtt, 10.1)) == MAX_REMEMBERED
+    known.note_lost([run(number) for number in range(10 * MAX_LOST_RUNS)], by_threshold=True)
+    assert len(known.late([(0, 10 * MAX_LOST_RUNS)], rtt, 10.1)) == MAX_LOST_RUNS
     known.note_lost([run(1), run(2, at=99.9)], by_threshold=True)
     known.forget_old(100.0)
     assert [part.first for part in known.late([(0, 9)], rtt, 100.0)] == [2]
@@ -150,8 +150,8 @@ def test_ranges_that_acknowledge_nothing_are_hardly_looked_at() -> None:
             return int(self) + other
 
     known = Reordering()
-    known.note_lost([run(1000 + 4 * number) for number in range(MAX_REMEMBERED)], by_threshold=True)
+    known.note_lost([run(1000 + 4 * number) for number in range(MAX_LOST_RUNS)], by_threshold=True)
     none = [(number, Numbers(number)) for number in range(990, 990 - 2 * MAX_ACK_RANGES, -2)]
     assert known.late(none, steady(), 10.1) == []
-    assert looked_at <= 7 * MAX_REMEMBERED, "not 32 times as often"
+    assert looked_at <= 7 * MAX_LOST_RUNS, "not 32 times as often"
     assert len(known.late([(1000, 1004), (0, 9)], steady(), 10.1)) == 2

@@ -27,7 +27,7 @@ def test_what_cannot_be_sent_is_rejected_at_once(monkeypatch: pytest.MonkeyPatch
 
 
 def test_requests_that_wait_are_capped_in_bytes_and_leave_room_when_they_end(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(requests_module, "MAX_HELD_BYTES", 1000)
+    monkeypatch.setattr(requests_module, "MAX_REQUEST_TABLE_BYTES", 1000)
     table = Table()
     table.submit(1, payload=bytes(600))
     table.submit(2, payload=bytes(600))

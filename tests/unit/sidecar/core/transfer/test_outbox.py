@@ -4,11 +4,11 @@ from typing import TYPE_CHECKING
 
 from plr.sidecar.core.base.values import PathState, Priority, RequestId
 from plr.sidecar.core.message.reassembly import MAX_PEER_BYTES
-from plr.sidecar.core.message.repair import MAX_COPIES
+from plr.sidecar.core.message.repair import MAX_DOUBLED_SYMBOLS
 from plr.sidecar.core.seam.links import FragmentsLost, LinkCommand, Resend, Send, SendAbandon
 from plr.sidecar.core.seam.stats import EngineStats
 from plr.sidecar.core.transfer.outbox import MAX_GENERATIONS, Outbox
-from plr.sidecar.core.transfer.room import LARGE_ROOM_BYTES, MAX_MESSAGES, SMALL_BYTES, SMALL_ROOM_BYTES
+from plr.sidecar.core.transfer.room import LARGE_ROOM_BYTES, MAX_UNDELIVERED_MESSAGES, SMALL_BYTES, SMALL_ROOM_BYTES
 from plr.sidecar.core.transfer.routes import Routes
 from plr.sidecar.core.wire.frame import BASE_BYTES
 from plr.sidecar.core.wire.messages import Encoded
@@ -141,8 +141,8 @@ def test_many_symbols_lost_at_once_travel_once() -> None:
     box = Box(OVER_WLAN)
     message = box.send(size=100_000)
     lossy(box, OVER_WLAN)
-    box.lost(message, *range(MAX_COPIES + 1))
-    assert box.commands == [Resend(OVER_WLAN, message.symbols, tuple(range(MAX_COPIES + 1)))]
+    box.lost(message, *range(MAX_DOUBLED_SYMBOLS + 1))
+    assert box.commands == [Resend(OVER_WLAN, message.symbols, tuple(range(MAX_DOUBLED_SYMBOLS + 1)))]
 
 
 def test_copies_do_not_hold_back_what_an_interface_took_with_it() -> None:
@@ -268,7 +268,7 @@ def test_the_box_is_capped_and_a_greedy_peer_does_not_lock_others_out() -> None:
     while box.outbox.admits(A, SMALL.size):
         box.outbox.send(OVER_WLAN, SMALL, priority=Priority.NORMAL, deadline=1.0, expires=10.0)
         taken += 1
-    assert taken == MAX_MESSAGES // 2
+    assert taken == MAX_UNDELIVERED_MESSAGES // 2
     assert box.stats.dropped["outbox_full"] == 1
     assert box.outbox.has_room(B, 1000)
 

@@ -12,7 +12,7 @@ from plr.protos.model.ids import NodeName
 from plr.sidecar.core.base.fair_share import Shares
 from plr.sidecar.core.base.values import ExecutionId, Priority
 from plr.sidecar.core.seam.application import AbandonExecution
-from plr.sidecar.ros.cloud.cloud_side import MAX_EXECUTIONS, SILENCE_S, TRUSTED_S, CloudSide
+from plr.sidecar.ros.cloud.cloud_side import MAX_PENDING_CALLS, SILENCE_S, TRUSTED_S, CloudSide
 from plr.sidecar.ros.cloud.request_window import RequestWindow
 from plr.sidecar.ros.cloud.service_runner import ServiceRunner
 from plr.sidecar.ros.stats import BridgeStats
@@ -23,8 +23,8 @@ def side() -> Any:
     """One whose loop and data plane do nothing."""
     made: Any = CloudSide.__new__(CloudSide)
     made._stats = BridgeStats()
-    made._executions = {}
-    made._shares = Shares(MAX_EXECUTIONS)
+    made._calls = {}
+    made._shares = Shares(MAX_PENDING_CALLS)
     made._paced = set()
     made._at_work = set()
     made._in_doubt = frozenset()
@@ -87,7 +87,7 @@ def test_what_is_given_up_makes_room_for_those_that_wait(side: Any) -> None:
     runner.name = "/plan"
     execution = ExecutionId(1)
     robot = NodeName("robot")
-    side._executions[execution] = (runner, SimpleNamespace(id=execution, robot=robot, number=1))
+    side._calls[execution] = (runner, SimpleNamespace(id=execution, robot=robot, number=1))
     side._shares.take(robot)
     side._abandon(AbandonExecution(execution, robot, awaited=False))
     assert side._paced == {runner}

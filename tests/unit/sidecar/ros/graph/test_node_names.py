@@ -62,10 +62,10 @@ def topic_of(names: NodeNames) -> Topic:
     return topic
 
 
-def look(names: NodeNames, now: float, *endpoints: bytes) -> list[str | None]:
-    names.begin_look()
+def scan(names: NodeNames, now: float, *endpoints: bytes) -> list[str | None]:
+    names.begin_scan()
     found = [names.name_of(endpoint, now) for endpoint in endpoints]
-    names.end_look()
+    names.end_scan()
     return found
 
 
@@ -73,7 +73,7 @@ def test_a_call_ends_when_all_have_answered(names: NodeNames, caplog: pytest.Log
     caplog.set_level(logging.INFO, "plr.sidecar")
     topic = topic_of(names)
     assert names.next_due() is None
-    look(names, 0.0, PLAN)
+    scan(names, 0.0, PLAN)
     assert not names.turn(0.5)
     assert not topic.under_way()
     assert not names.turn(UNKNOWN_FOR_S)
@@ -82,14 +82,14 @@ def test_a_call_ends_when_all_have_answered(names: NodeNames, caplog: pytest.Log
     assert not names.turn(UNKNOWN_FOR_S + POLL_S / 2), "it is heard now and then, not in each turn"
     assert names.turn(UNKNOWN_FOR_S + POLL_S)
     assert not topic.under_way()
-    assert look(names, 2.0, PLAN) == ["/planner"]
+    assert scan(names, 2.0, PLAN) == ["/planner"]
     assert [record.getMessage().rsplit(": ", 1)[1] for record in caplog.records] == ["/planner"]
     assert names.next_due() is None
 
 
 def test_a_call_ends_in_its_time(names: NodeNames) -> None:
     topic = topic_of(names)
-    look(names, 0.0, PLAN, OTHER)
+    scan(names, 0.0, PLAN, OTHER)
     names.turn(1.0)
     topic.answers = [OF_SEVEN]
     assert names.turn(1.1)
@@ -104,14 +104,14 @@ def test_a_call_ends_in_its_time(names: NodeNames) -> None:
 
 def test_what_can_not_be_read_is_counted(names: NodeNames, stats: BridgeStats) -> None:
     topic = topic_of(names)
-    look(names, 0.0, PLAN, OTHER)
+    scan(names, 0.0, PLAN, OTHER)
     names.turn(1.0)
     topic.answers = [OF_SEVEN[:-1], participant_info(8, [("/", "a", [], [])]), b"", participant_info(9, [])]
     assert not names.turn(1.1)
     assert stats.dropped == {"bad_discovery_message": 1}
-    assert look(names, 2.0, PLAN) == [None]
+    assert scan(names, 2.0, PLAN) == [None]
 
 
 def test_what_there_is_no_room_for_is_counted(names: NodeNames, stats: BridgeStats) -> None:
-    look(names, 0.0, *(endpoint(7, number) for number in range(MAX_ENDPOINTS + 2)))
+    scan(names, 0.0, *(endpoint(7, number) for number in range(MAX_ENDPOINTS + 2)))
     assert stats.dropped == {"too_many_unknown_nodes": 2}

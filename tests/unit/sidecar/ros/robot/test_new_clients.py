@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import random
 
-from plr.sidecar.ros.robot.new_clients import GIVE_UP_S, MAX_KEPT, MAX_RETRY_S, REST_S, NewClients
+from plr.sidecar.ros.robot.new_clients import GIVE_UP_S, MAX_KEPT_ANSWERS, MAX_RETRY_S, REST_S, NewClients
 
 
 def test_answers_stay_in_order_and_go_when_the_client_is_known() -> None:
@@ -70,5 +70,5 @@ def test_many_clients_take_turns_with_a_rest_between() -> None:
 
 def test_what_is_kept_is_bounded() -> None:
     subject: NewClients[int] = NewClients()
-    assert all(subject.keep(b"a", number, 100.0) for number in range(MAX_KEPT))
+    assert all(subject.keep(b"a", number, 100.0) for number in range(MAX_KEPT_ANSWERS))
     assert not subject.keep(b"b", 0, 100.0)

@@ -14,7 +14,7 @@ A, B = b"a" * 16, b"b" * 16
 
 def test_a_few_at_once_and_the_rest_spaced() -> None:
     pacer: ReplyPacer[int] = ReplyPacer()
-    sent = [number for number in range(20) if pacer.offer(A, number, 1.0, late=False)]
+    sent = [number for number in range(20) if pacer.admit(A, number, 1.0, late=False)]
     assert sent == list(range(BURST_ANSWERS))
     assert pacer.queued == 12
     assert pacer.take_due(1.0) == []
@@ -30,21 +30,21 @@ def test_a_few_at_once_and_the_rest_spaced() -> None:
 
 def test_an_answer_never_overtakes_a_waiting_one() -> None:
     pacer: ReplyPacer[int] = ReplyPacer(burst=1)
-    assert pacer.offer(A, 0, 0.0, late=False)
-    assert not pacer.offer(A, 1, 0.0, late=False)
-    assert not pacer.offer(A, 2, 0.01, late=False)  # there is an allowance again, but 1 waits for it
+    assert pacer.admit(A, 0, 0.0, late=False)
+    assert not pacer.admit(A, 1, 0.0, late=False)
+    assert not pacer.admit(A, 2, 0.01, late=False)  # there is an allowance again, but 1 waits for it
     assert pacer.take_due(0.01) == [1]
     assert pacer.take_due(0.02) == [2]
 
 
 def test_an_answer_in_time_goes_before_late_ones_that_wait() -> None:
     pacer: ReplyPacer[str] = ReplyPacer(burst=1)
-    assert pacer.offer(A, "late 0", 0.0, late=True)
-    assert not pacer.offer(A, "late 1", 0.0, late=True)
-    assert not pacer.offer(A, "late 2", 0.0, late=True)
-    assert not pacer.offer(A, "in time", 0.0, late=False)
+    assert pacer.admit(A, "late 0", 0.0, late=True)
+    assert not pacer.admit(A, "late 1", 0.0, late=True)
+    assert not pacer.admit(A, "late 2", 0.0, late=True)
+    assert not pacer.admit(A, "in time", 0.0, late=False)
     assert pacer.take_due(0.01) == ["in time"]
-    assert pacer.offer(A, "in time, with an allowance", 0.02, late=False)
+    assert pacer.admit(A, "in time, with an allowance", 0.02, late=False)
     assert pacer.take_due(0.02) == []
     assert pacer.take_due(0.03) == ["late 1"]
     assert pacer.take_due(0.04) == ["late 2"]
@@ -53,7 +53,7 @@ def test_an_answer_in_time_goes_before_late_ones_that_wait() -> None:
 
 def test_late_answers_are_spaced_wider_and_leave_room_for_one_in_time() -> None:
     pacer: ReplyPacer[int] = ReplyPacer()
-    now, sent = 10.0, [number for number in range(40) if pacer.offer(A, number, 10.0, late=True)]
+    now, sent = 10.0, [number for number in range(40) if pacer.admit(A, number, 10.0, late=True)]
     assert sent == [0]
     while pacer.queued:
         due = pacer.next_due()
@@ -65,9 +65,9 @@ def test_late_answers_are_spaced_wider_and_leave_room_for_one_in_time() -> None:
     wanted_s = 39 * LATE_COST * SPACING_S - (BURST_ANSWERS - LATE_COST) * SPACING_S
     assert abs(now - 10.0 - wanted_s) < 1e-6
     pacer = ReplyPacer()
-    assert pacer.offer(A, 0, 20.0, late=True)
-    assert not pacer.offer(A, 1, 20.0, late=True)
-    assert pacer.offer(A, 2, 20.0, late=False)
+    assert pacer.admit(A, 0, 20.0, late=True)
+    assert not pacer.admit(A, 1, 20.0, late=True)
+    assert pacer.admit(A, 2, 20.0, late=False)
 
 
 def test_one_request_after_the_other_is_never_held_back() -> None:
@@ -76,22 +76,22 @@ def test_one_request_after_the_other_is_never_held_back() -> None:
     for number in range(1000):
         now += SPACING_S / 10
         pacer.request_taken(A, now)
-        assert pacer.offer(A, number, now, late=False)
+        assert pacer.admit(A, number, now, late=False)
 
 
 def test_clients_do_not_wait_for_each_other() -> None:
     pacer: ReplyPacer[int] = ReplyPacer()
     for number in range(20):
-        pacer.offer(A, number, 0.0, late=False)
-    assert all(pacer.offer(B, number, 0.0, late=False) for number in range(BURST_ANSWERS))
+        pacer.admit(A, number, 0.0, late=False)
+    assert all(pacer.admit(B, number, 0.0, late=False) for number in range(BURST_ANSWERS))
 
 
 def test_clients_without_waiting_answers_are_forgotten() -> None:
     pacer: ReplyPacer[int] = ReplyPacer(burst=1)
-    assert pacer.offer(A, 0, 0.0, late=False)
-    assert not pacer.offer(A, 1, 0.0, late=False)
+    assert pacer.admit(A, 0, 0.0, late=False)
+    assert not pacer.admit(A, 1, 0.0, late=False)
     for number in range(2 * MAX_CLIENTS):
-        assert pacer.offer(number.to_bytes(16, "big"), 0, 0.0, late=False)
+        assert pacer.admit(number.to_bytes(16, "big"), 0, 0.0, late=False)
     assert len(pacer._clients) == MAX_CLIENTS
     assert pacer.take_due(1.0) == [1]
 
@@ -119,7 +119,7 @@ def test_a_queue_of_ten_never_overflows(seed: int, offered: list[float], asked_e
 
     for number, at in enumerate(sorted(offered)):
         advance(at)
-        if pacer.offer(A, number, now, late=False):
+        if pacer.admit(A, number, now, late=False):
             deliveries.append((now, number))
     advance(now + 1.0)
     assert [reply for _, reply in deliveries] == list(range(len(offered)))

@@ -46,7 +46,7 @@ def test_what_found_no_room_is_sent_as_answers_make_it() -> None:
 def test_what_is_over_leaves_no_trace_among_those_that_wait_for_room() -> None:
     table = crowded()
     assert table.sent()
-    table.table.answered_here(request_id(ASKED), 0.5)
+    table.table.answered_locally(request_id(ASKED), 0.5)
     table.handle_timers(1.0)
     assert table.table.unanswered == ASKED - 1
     for step in table.table.withdraw(ECHO, ""):

@@ -9,7 +9,7 @@ import pytest
 
 from plr.protos.model.redundancy_mode import RedundancyMode
 from plr.sidecar.core.base.values import PathId, PathState, RejectReason
-from plr.sidecar.core.robot.dispatch.dispatcher import MAX_COPIES
+from plr.sidecar.core.robot.dispatch.dispatcher import MAX_COPIES_OF_REQUEST
 from plr.sidecar.core.seam.application import ResponseArrived
 from plr.sidecar.core.seam.links import Seek
 from tests.support.builders import A, B, request_id
@@ -61,7 +61,7 @@ def test_flapping_paths_do_not_multiply_copies_without_end() -> None:
             table.change(known, PathState.UNSTABLE, now=turn * 0.01)
         for known in SERVERS.values():
             table.change(known, PathState.UP, now=turn * 0.01)
-    assert len(table.sent()) <= MAX_COPIES
+    assert len(table.sent()) <= MAX_COPIES_OF_REQUEST
 
 
 @pytest.mark.parametrize("reason", RejectReason)

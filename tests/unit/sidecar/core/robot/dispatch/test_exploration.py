@@ -12,8 +12,8 @@ from plr.protos.model.ids import Version
 from plr.protos.model.mapping import Assignment, MappingSet, ServiceMapping
 from plr.sidecar.core.base.values import PathId, PathState, RejectReason, RequestId
 from plr.sidecar.core.robot.dispatch.exploration import (
+    MAX_EXPLORING_BYTES,
     MAX_PER_S,
-    MAX_REQUEST_BYTES,
     MAX_SAVED,
     MAX_WAITING_MESSAGES,
     MIN_INTERVAL_S,
@@ -54,7 +54,7 @@ def test_a_race_gets_one_more_copy_and_reports_it_like_any_other() -> None:
 
 @pytest.mark.parametrize(
     ("share", "idempotent", "number", "size"),
-    [(0.0, True, RACE, 8), (0.01, False, RACE, 8), (0.01, True, 1, 8), (0.01, True, RACE, MAX_REQUEST_BYTES + 1)],
+    [(0.0, True, RACE, 8), (0.01, False, RACE, 8), (0.01, True, 1, 8), (0.01, True, RACE, MAX_EXPLORING_BYTES + 1)],
     ids=["switched off", "may run once only", "no race", "large"],
 )
 def test_what_does_not_explore(share: float, idempotent: bool, number: int, size: int) -> None:

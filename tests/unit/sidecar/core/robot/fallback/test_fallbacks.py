@@ -243,7 +243,7 @@ def test_the_queue_has_an_end() -> None:
 
 
 def test_payloads_are_not_kept_beyond_the_limit(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("plr.sidecar.core.robot.fallback.fallbacks.MAX_HELD_BYTES", 2)
+    monkeypatch.setattr("plr.sidecar.core.robot.fallback.fallbacks.MAX_FALLBACK_BYTES", 2)
     world = World()
     world.submit(1, 2, 3)
     assert world.counted() == {"overloaded": 1}

@@ -8,7 +8,7 @@ import pytest
 from plr.protos.convert import parse_sidecar_message, sidecar_message_to_proto
 from plr.protos.model.ids import InterfaceName, NodeName, ServiceName
 from plr.protos.model.mapping import Assignment
-from plr.protos.model.report import MAX_PATHS, InterfaceJointReport, JointReport, OutcomeReport
+from plr.protos.model.report import MAX_PATH_REPORTS, InterfaceJointReport, JointReport, OutcomeReport
 from plr.sidecar.core.base.report_scope import ReportScope
 from plr.sidecar.core.base.values import PathState
 from plr.sidecar.core.robot.measure import measurements as measurements_module
@@ -154,7 +154,7 @@ def test_outcomes_by_pair_of_interfaces_are_counted_up_to_a_limit(monkeypatch: p
 
 
 def test_paths_that_one_report_has_no_room_for_are_told_by_turns(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(measurements_module, "MAX_PATHS", 4)
+    monkeypatch.setattr(measurements_module, "MAX_PATH_REPORTS", 4)
     dropped: Counter[str] = Counter()
     measurements, routes = Measurements(dropped), Routes()
     servers = [NodeName(f"cloud-{number}") for number in range(3)]
@@ -182,7 +182,7 @@ def test_paths_that_one_report_has_no_room_for_are_told_by_turns(monkeypatch: py
 
 def test_a_report_of_the_most_paths_is_one_that_the_control_plane_takes() -> None:
     measurements, routes = Measurements(Counter()), Routes()
-    servers = [NodeName(f"cloud-{number}") for number in range(MAX_PATHS // 2 + 1)]
+    servers = [NodeName(f"cloud-{number}") for number in range(MAX_PATH_REPORTS // 2 + 1)]
     for server in servers:
         for nic in (WLAN, WWAN):
             routes.set_state(path(nic, server), PathState.UP)

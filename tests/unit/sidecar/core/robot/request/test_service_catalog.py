@@ -9,7 +9,7 @@ from plr.protos.model.ids import ServiceName
 from plr.protos.model.members import Peer, ServiceOffer
 from plr.sidecar.core.base.values import PathState
 from plr.sidecar.core.robot.request import service_catalog
-from plr.sidecar.core.robot.request.service_catalog import MAX_OFFERED, WITHDRAW_AFTER_S, Offers
+from plr.sidecar.core.robot.request.service_catalog import MAX_OFFERED_SERVICES, WITHDRAW_AFTER_S, Offers
 from plr.sidecar.core.rules.service_rule import Rules
 from plr.sidecar.core.seam.application import OfferService, WithdrawService
 from plr.sidecar.core.seam.stats import EngineStats
@@ -242,25 +242,25 @@ def test_a_service_gains_each_new_server_once() -> None:
 
 @pytest.mark.audit("sec-5")
 def test_a_cloud_that_offers_everything_leaves_room_for_what_others_offer() -> None:
-    many = tuple(ServiceOffer(ServiceName(f"/made_up_{number}"), TYPE) for number in range(2 * MAX_OFFERED))
+    many = tuple(ServiceOffer(ServiceName(f"/made_up_{number}"), TYPE) for number in range(2 * MAX_OFFERED_SERVICES))
     robot = Robot(peer(A, offers=many), pattern="/*")
-    assert len(robot.update()) == MAX_OFFERED // 2
-    assert robot.stats.dropped["too_many_offers"] == len(many) - MAX_OFFERED // 2
+    assert len(robot.update()) == MAX_OFFERED_SERVICES // 2
+    assert robot.stats.dropped["too_many_offers"] == len(many) - MAX_OFFERED_SERVICES // 2
     robot.set_peers([peer(A, offers=many), peer(B, session=2)])
     assert robot.update() == [OfferService(ECHO, TYPE)]
-    assert robot.stats.dropped["too_many_offers"] == len(many) - MAX_OFFERED // 2, "each is counted once"
+    assert robot.stats.dropped["too_many_offers"] == len(many) - MAX_OFFERED_SERVICES // 2, "each is counted once"
     assert robot.update() == []
 
 
 @pytest.mark.audit("sec-5")
 def test_what_found_no_room_is_offered_when_there_is_some() -> None:
-    many = tuple(ServiceOffer(ServiceName(f"/s{number}"), TYPE) for number in range(MAX_OFFERED))
+    many = tuple(ServiceOffer(ServiceName(f"/s{number}"), TYPE) for number in range(MAX_OFFERED_SERVICES))
     robot = Robot(peer(A, offers=many), pattern="/*")
-    assert len(robot.update()) == MAX_OFFERED // 2
+    assert len(robot.update()) == MAX_OFFERED_SERVICES // 2
     others = tuple(offer for offer in many if offer.name not in robot.offers.offered)
     robot.set_peers([peer(A, offers=others)])
     robot.update(10.0)
     events = robot.update(10.0 + WITHDRAW_AFTER_S)
-    assert sum(isinstance(event, WithdrawService) for event in events) == MAX_OFFERED // 2
-    assert sum(isinstance(event, OfferService) for event in events) == MAX_OFFERED // 2
+    assert sum(isinstance(event, WithdrawService) for event in events) == MAX_OFFERED_SERVICES // 2
+    assert sum(isinstance(event, OfferService) for event in events) == MAX_OFFERED_SERVICES // 2
     assert set(robot.offers.offered) == {offer.name for offer in others}

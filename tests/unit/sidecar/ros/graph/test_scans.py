@@ -1,4 +1,4 @@
-"""Looks at the graph: a little of each in one go, a rest after each, and none while nothing changes."""
+"""Scans of the graph: a little of each in one go, a rest after each, and none while nothing changes."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from plr.sidecar.ros.graph.looks import FIRST_SETTLING_S, IDLE_PERIOD_S, REST, TURN_S, Looks
+from plr.sidecar.ros.graph.scans import FIRST_SETTLING_S, IDLE_PERIOD_S, REST, TURN_S, Scans
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -16,15 +16,15 @@ STEP_S = 0.0001
 
 
 class Graph:
-    """A look at it takes `services` steps; the clock runs only while it is looked at."""
+    """A scan of it takes `services` steps; the clock runs only while it is scanned."""
 
     def __init__(self, services: int) -> None:
         self.services = services
         self.now = 0.0
-        self.looks = 0
+        self.scans = 0
         self.settling = False
         self.fails = False
-        self.made = Looks(self.begin, lambda: self.settling, self.now, lambda: self.now)
+        self.made = Scans(self.begin, lambda: self.settling, self.now, lambda: self.now)
 
     def begin(self) -> Iterator[None]:
         for _ in range(self.services):
@@ -32,7 +32,7 @@ class Graph:
             yield
         if self.fails:
             raise RuntimeError("rmw is broken")
-        self.looks += 1
+        self.scans += 1
 
     def run_until(self, end: float) -> list[float]:
         """Turn whenever it is due; returns how long each turn took."""
@@ -46,28 +46,28 @@ class Graph:
 
 
 @pytest.mark.audit("dp-10")
-def test_a_look_at_many_services_is_done_in_short_turns() -> None:
+def test_a_scan_of_many_services_is_done_in_short_turns() -> None:
     graph = Graph(services=400)
     took = graph.run_until(1.0)
-    assert graph.looks == 1
+    assert graph.scans == 1
     assert len(took) == pytest.approx(400 * STEP_S / TURN_S, abs=2)
     assert max(took) < TURN_S + 2 * STEP_S
 
 
 @pytest.mark.audit("dp-10")
-def test_without_a_change_the_graph_is_hardly_looked_at() -> None:
+def test_without_a_change_the_graph_is_hardly_scanned() -> None:
     graph = Graph(services=400)
     graph.run_until(60.0)
-    assert graph.looks <= 60.0 / IDLE_PERIOD_S + 1
+    assert graph.scans <= 60.0 / IDLE_PERIOD_S + 1
 
 
-def test_a_change_is_looked_at_at_once() -> None:
+def test_a_change_is_followed_by_a_scan_at_once() -> None:
     graph = Graph(services=10)
     graph.run_until(1.0)
     graph.made.changed(graph.now)
     assert graph.made.next_due() == graph.now
     graph.run_until(graph.now)
-    assert graph.looks == 2
+    assert graph.scans == 2
 
 
 @pytest.mark.audit("dp-10")
@@ -78,31 +78,31 @@ def test_changes_without_end_take_a_tenth_of_the_time() -> None:
         graph.made.changed(graph.now)
         spent += sum(graph.run_until(graph.now + 0.001))
     assert spent / graph.now < 1.1 / (1.0 + REST)
-    assert graph.looks > 10.0 * 0.8 / ((1.0 + REST) * 400 * STEP_S)
+    assert graph.scans > 10.0 * 0.8 / ((1.0 + REST) * 400 * STEP_S)
 
 
-def test_a_change_during_a_look_is_looked_at_after_it() -> None:
+def test_a_change_during_a_scan_is_followed_by_another() -> None:
     graph = Graph(services=400)
     graph.made.turn(graph.now)
     graph.made.changed(graph.now)
     graph.run_until(graph.now + 2.0)
-    assert graph.looks == 2
+    assert graph.scans == 2
 
 
-def test_while_something_settles_looks_follow_ever_more_rarely() -> None:
+def test_while_something_settles_scans_follow_ever_more_rarely() -> None:
     graph = Graph(services=1)
     graph.settling = True
     graph.run_until(0.5)
-    assert graph.looks >= 4
+    assert graph.scans >= 4
     graph.run_until(600.0)
-    assert graph.looks < 600.0 / IDLE_PERIOD_S + 12
+    assert graph.scans < 600.0 / IDLE_PERIOD_S + 12
     graph.made.changed(graph.now)
-    looks, now = graph.looks, graph.now
+    scans, now = graph.scans, graph.now
     graph.run_until(now + 3 * FIRST_SETTLING_S)
-    assert graph.looks >= looks + 2
+    assert graph.scans >= scans + 2
 
 
-def test_a_look_that_fails_is_made_again_in_its_time() -> None:
+def test_a_scan_that_fails_is_repeated_in_its_time() -> None:
     graph = Graph(services=3)
     graph.fails = True
     with pytest.raises(RuntimeError):
@@ -110,4 +110,4 @@ def test_a_look_that_fails_is_made_again_in_its_time() -> None:
     graph.fails = False
     assert graph.made.next_due() > graph.now
     graph.run_until(graph.now + IDLE_PERIOD_S)
-    assert graph.looks == 1
+    assert graph.scans == 1

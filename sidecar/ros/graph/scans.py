@@ -1,6 +1,6 @@
-"""Decides when to look at the local ROS graph, and how much of a look to do in one go.
+"""Decides when to scan the local ROS graph, and how much of a scan to do in one go.
 
-The ROS thread carries requests as well, and a look at some hundred services takes tens of milliseconds. So a look is a
+The ROS thread carries requests as well, and a scan of some hundred services takes tens of milliseconds. So a scan is a
 generator of small steps, and a few of them run between two waits.
 """
 
@@ -15,17 +15,17 @@ if TYPE_CHECKING:
 TURN_S = 0.002
 """Time on the ROS thread in one go; with the longest step, this is how long a request may have to wait."""
 REST = 9.0
-"""Rest after a look, as a multiple of its duration: a graph that changes all the time, as while a large system starts,
+"""Rest after a scan, as a multiple of its duration: a graph that changes all the time, as while a large system starts,
 costs a tenth of the ROS thread."""
 FIRST_SETTLING_S = 0.02
-"""First pause between looks after a change, while one of our entities waits to be matched or for its time; it doubles
-with each look."""
+"""First pause between scans after a change, while one of our entities waits to be matched or for its time; it doubles
+with each scan."""
 IDLE_PERIOD_S = 5.0
 """Pause without any change: finds unreported changes, and serves work that has its own timing."""
 
 
-class Looks:
-    """Runs one look after the other. `begin` returns a look's steps; `settling`, whether another should follow soon."""
+class Scans:
+    """Runs one scan after the other. `begin` returns a scan's steps; `settling`, whether another should follow soon."""
 
     def __init__(
         self,
@@ -34,7 +34,7 @@ class Looks:
         now: float,
         clock: Callable[[], float] = time.thread_time,
     ) -> None:
-        """Take as `clock` the thread's CPU time, so that a busy machine does not make looks rarer."""
+        """Take as `clock` the thread's CPU time, so that a busy machine does not make scans rarer."""
         self._begin = begin
         self._settling = settling
         self._clock = clock
@@ -54,11 +54,11 @@ class Looks:
             self._due_at = min(self._due_at, max(now, self._rested_at))
 
     def next_due(self) -> float:
-        """Return when `turn` has something to do; a time in the past while a look is under way."""
+        """Return when `turn` has something to do; a time in the past while a scan is under way."""
         return float("-inf") if self._steps is not None else self._due_at
 
     def turn(self, now: float) -> None:
-        """Continue the look for about TURN_S, or begin one if it is due. An exception ends that look, not the next."""
+        """Continue the scan for about TURN_S, or begin one if it is due. An exception ends that scan, not the next."""
         if self._steps is None:
             if now < self._due_at:
                 return

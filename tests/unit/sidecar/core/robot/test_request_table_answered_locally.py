@@ -31,7 +31,7 @@ def test_what_the_network_has_not_answered_by_the_deadline_is_a_miss_and_over(
 ) -> None:
     table = Table()
     table.submit(number)
-    table.table.answered_here(request_id(number), 0.9)
+    table.table.answered_locally(request_id(number), 0.9)
     assert table.table.unanswered == 1
     table.table.handle_timer(1.0)
     assert table.only_failure().outcome == "deadline_missed"
@@ -45,7 +45,7 @@ def test_what_the_network_has_not_answered_by_the_deadline_is_a_miss_and_over(
 def test_what_the_network_answers_by_the_deadline_is_no_miss() -> None:
     table = Table()
     table.submit(RACE)
-    table.table.answered_here(request_id(RACE), 0.5)
+    table.table.answered_locally(request_id(RACE), 0.5)
     table.respond(B, copy=1, number=RACE, now=0.9)
     assert [type(event) for event in table.events] == [ResponseArrived]
     table.table.handle_timer(1.0)
@@ -58,17 +58,17 @@ def test_after_the_deadline_it_is_over_at_once() -> None:
     table.submit()
     table.table.handle_timer(1.0)
     table.sent()
-    table.table.answered_here(request_id(1), 1.2)
+    table.table.answered_locally(request_id(1), 1.2)
     assert table.only_failure().outcome == "deadline_missed"
     assert len(table.cancelled()) == 2
-    table.table.answered_here(request_id(1), 1.3)
+    table.table.answered_locally(request_id(1), 1.3)
     table.assert_empty()
 
 
 def test_no_further_copies_are_sent() -> None:
     table = Table()
     table.submit()
-    table.table.answered_here(request_id(1), 0.2)
+    table.table.answered_locally(request_id(1), 0.2)
     table.sent()
     table.change(WLAN_A, PathState.DOWN)
     table.reject(RejectReason.OVERLOADED, B, copy=1)
