@@ -244,7 +244,7 @@ class Dispatching:
             self._budgets.earn(request.copies[0].message.symbols.total, {path.interface for path in paths})
 
     def _send(self, request: Request, path: PathId, now: float, why: _Why) -> bool:
-        """Send a copy for which the path's server has room; return whether budgets and MAX_COPIES_OF_REQUEST allow it."""
+        """Send a copy for which the server has room; return whether the budgets and MAX_COPIES_OF_REQUEST allow it."""
         sent = len(request.copies)
         if request.payload is None or (sent >= MAX_COPIES_OF_REQUEST and sent >= _most_copies(request)):
             return False
