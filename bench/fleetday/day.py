@@ -16,6 +16,7 @@ from bench.fleetday.sizes import Sizes, grown, measure
 from bench.fleetday.timeline import Timeline
 from plr.controlplane.core.base.member_table import MAX_MEMBERS
 from plr.controlplane.core.control.events import Settings
+from plr.controlplane.core.estimate.estimator import MAX_PAIRS_PER_ROBOT
 from plr.controlplane.core.estimate.processing import MAX_PROCESSING
 from plr.controlplane.core.estimate.reached import MAX_REACHED_PAIRS
 from plr.controlplane.core.explain.departed import MAX_DEPARTED, MAX_EXPLAINED
@@ -75,8 +76,10 @@ CAPPED = {
     "_publisher._known_peers._former": MAX_MEMBERS,
     "_publisher._known_peers._former[]": MAX_MEMBERS * MAX_PERMITS_KEPT,
     "estimator._compute._servers": MAX_PROCESSING,
+    # What was computed at the last look at a robot, of its pairs: as many as that one asked for.
+    "estimator._robots[].troubles[]._met[]": MAX_MEMBERS * MAX_PAIRS_PER_ROBOT,
 }
-"""Tables that remember departed members, with their caps."""
+"""Tables that remember departed members, or what was computed last, with their caps."""
 
 POLICIES: tuple[Policy | None, ...] = (
     None,
