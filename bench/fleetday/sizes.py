@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
 
-OURS = ("bench.", "controlplane.", "protos.", "sidecar.", "tests.")
+OURS = ("bench.", "plr.", "tests.")
 """Modules whose objects are examined."""
 
 

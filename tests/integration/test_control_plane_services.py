@@ -152,7 +152,6 @@ def test_plr_status_imports_only_what_it_needs(plane: ControlPlaneProcess) -> No
         "plr.controlplane.config.controlplane",
         "plr.controlplane.core",
         "plr.controlplane.loop",
-        "controlplane.version",
     )
     assert modules & {*heavy, *rest, *ours} == set()
     assert {"grpc", "plr.controlplane.cli.status_command"} <= modules
