@@ -304,7 +304,7 @@ class ServiceConfig(Section):
         if self.fallback_start is FallbackStart.ON_MISS:
             yield "fallback_takes_ms", "expected only beside fallback_start: in_time"
         elif self.fallback_takes_ms >= (most := (1 - SPARE) * self.deadline_ms):
-            yield "fallback_takes_ms", f"expected less than {most:g}, else it can not answer by deadline_ms"
+            yield "fallback_takes_ms", f"expected less than {most:g}, else it cannot answer by deadline_ms"
 
 
 def _redundancy(fec: float | str) -> Redundancy:
