@@ -50,6 +50,9 @@ SESSION = SessionId(77)
 TOKEN = bytes(15) + b"r"
 
 
+FULL_PAUSE_S = 0.002
+
+
 class BadSocket(socket.socket):
     """Its sends take `hang_s` each; while it is `full` it takes nothing."""
 
@@ -75,6 +78,9 @@ class BadSocket(socket.socket):
         if self.hang_s:
             time.sleep(self.hang_s)
         if self.full:
+            # The kernel calls this socket writable all the time, unlike one that is full: without a pause its thread
+            # would spin, and all others would wait for the interpreter.
+            time.sleep(FULL_PAUSE_S)
             raise BlockingIOError
 
 
