@@ -12,7 +12,7 @@ unexport ROS_DISTRO ROS_VERSION ROS_PYTHON_VERSION _ROS_WHEELS_BOOTSTRAP_COMPLET
 # Nothing that we start announces itself to the network.
 export ROS_AUTOMATIC_DISCOVERY_RANGE ?= LOCALHOST
 
-.PHONY: help setup demo test quick fuzz lint format protos pages docs interfaces lock bench bench-quick bench-dataplane bench-churn bench-insiders bench-control bench-fleet-day bench-matcher clean distclean
+.PHONY: help setup demo test quick fuzz lint format protos pages docs interfaces lock bench bench-quick bench-dataplane bench-churn bench-insiders bench-control bench-fleet-day bench-drives bench-matcher clean distclean
 
 help: ## show this list
 	@echo 'usage: make TARGET'
@@ -80,6 +80,9 @@ bench-control: setup ## measure the control plane with 500 to 4,000 sidecars: a 
 
 bench-fleet-day: setup ## simulate 24 hours of a fleet of 1,000 that joins, leaves, roams and loses servers: nothing drifts, nothing grows
 	@$(PY) -m bench fleet-day $(BENCH_ARGS)
+
+bench-drives: setup ## compare the real cores with oracles on recorded drives, in simulated time (half an hour)
+	@$(PY) -m bench drives $(BENCH_ARGS)
 
 bench-matcher: setup ## compare the matcher's predictions with recorded networks, and measure its speed and reaction (half an hour)
 	@$(PY) -m bench matcher $(BENCH_ARGS)

@@ -7,6 +7,7 @@ examples:
   make bench-insiders BENCH_ARGS='--minutes 2'               a robot and a cloud of the fleet attack the others
   make bench-control BENCH_ARGS='--size 500'                 a fleet's control streams at one control plane
   python -m bench alerts                                     what a real Alertmanager says when one server of five dies
+  python -m bench drives --traces ~/traces                   the real cores beside oracles, in simulated time
   python -m bench micro                                      counts what one request passes through: calls, files
   make bench-fleet-day BENCH_ARGS='--members 100 --hours 6'  shows whether anything drifts or grows in a day
   make bench-quick                                           15 s of a drive with every contender
@@ -26,6 +27,7 @@ from bench.alerts import command as alerts
 from bench.churn import command as churn
 from bench.control import command as control
 from bench.dataplane import command as dataplane
+from bench.drives import command as drives
 from bench.evaluation import command as evaluate
 from bench.evaluation import report_command as report
 from bench.evaluation import scenarios_command as scenarios
@@ -57,6 +59,9 @@ def main() -> int:
     fleet_day.add_arguments(
         commands.add_parser("fleet-day", help="simulate 24 hours of a fleet of 1,000: nothing drifts, nothing grows")
     )
+    drives.add_arguments(
+        commands.add_parser("drives", help="compare the real cores with oracles on recorded drives, in simulated time")
+    )
     matcher.add_arguments(
         commands.add_parser("matcher", help="compare predicted with observed misses, on recorded traces")
     )
@@ -78,6 +83,7 @@ def main() -> int:
         "churn": churn.run,
         "control": control.run,
         "dataplane": dataplane.run,
+        "drives": drives.run,
         "evaluate": evaluate.run,
         "fleet-day": fleet_day.run,
         "insiders": insiders.run,

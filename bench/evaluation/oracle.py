@@ -27,11 +27,11 @@ OVERHEAD = 1.05
 _HALVINGS = 40
 
 
-class _Path:
+class OraclePath:
     """One path to an idle server."""
 
     def __init__(self, steps: Sequence[Step], traffic: Traffic) -> None:
-        self._up = FifoLink(steps, up=True)
+        self.up = FifoLink(steps, up=True)
         self._down = FifoLink(steps, up=False)
         self._compute_s = traffic.compute_ms / 1e3
         self._answer_bytes = traffic.answer_bytes
@@ -40,7 +40,7 @@ class _Path:
 
     def answered(self, left_s: float) -> float:
         """Return when the answer arrives, if the request has left at `left_s`."""
-        starts = left_s + self._up.delay_at(left_s) + self._compute_s
+        starts = left_s + self.up.delay_at(left_s) + self._compute_s
         back = self._down.time_of(self._down.capacity_by(starts) + self._answer_bytes)
         return back if math.isinf(back) else back + self._down.delay_at(back)
 
@@ -54,16 +54,20 @@ class _Path:
             early, late = (middle, late) if self.answered(middle) <= deadline_s else (early, middle)
         return early
 
+    def end_of(self, begin_s: float, size: float) -> float:
+        """Return when this many bytes have left that begin to leave at `begin_s`; inf if the trace ends before."""
+        return self.up.time_of(self.up.capacity_by(begin_s) + size)
+
     def room(self, begin_s: float, end_s: float) -> float:
         """Return the bytes that can leave between the two times."""
-        return self._up.capacity_by(end_s) - self._up.capacity_by(begin_s)
+        return self.up.capacity_by(end_s) - self.up.capacity_by(begin_s)
 
 
 def compute(scenario: Scenario) -> Outcome:
     """Return the oracle's outcome, which is always the same. A request that it gives up has no answer."""
     traffic = scenario.traffic
     trace = scenario.trace()
-    paths = [_Path(trace.path(name), traffic) for name in ("a", "b")]
+    paths = [OraclePath(trace.path(name), traffic) for name in ("a", "b")]
     requests = []
     for number in range(scenario.count):
         due_s = number / traffic.rate_hz
@@ -72,7 +76,7 @@ def compute(scenario: Scenario) -> Outcome:
     return Outcome(scenario.name, scenario.case, ORACLE, traffic.deadline_ms, tuple(requests))
 
 
-def _send(paths: Sequence[_Path], due_s: float, deadline_s: float, size: float) -> float | None:
+def _send(paths: Sequence[OraclePath], due_s: float, deadline_s: float, size: float) -> float | None:
     """Send a request over both paths and return when it is answered; if it cannot be in time, send nothing: None."""
     spans = [(path, begin := max(path.free_s, due_s), path.last_use(begin, deadline_s)) for path in paths]
     used = [(path, begin, end) for path, begin, end in spans if end > begin]

@@ -87,6 +87,10 @@ class FifoLink:
         rate = self._rates[step]
         return self._starts[step] + (capacity - self._capacity[step]) / rate if rate else math.inf
 
+    def rate_at(self, at: float) -> float:
+        """Return the rate at that time in bytes a second."""
+        return self._rates[self._step(at)]
+
     def delay_at(self, at: float) -> float:
         """Return the propagation delay in seconds of a packet that leaves `at` that time."""
         return self._delays[self._step(at)]

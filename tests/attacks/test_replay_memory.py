@@ -10,6 +10,8 @@ from typing import TYPE_CHECKING
 
 import pytest
 
+from lab.simulated.mesh import Mesh, rule
+from lab.simulated.sessions import credential_of, seal, session_of
 from plr.protos.model.ids import InterfaceId, InterfaceName, NodeName, Role, SessionId, Version
 from plr.protos.model.members import PeerSet
 from plr.sidecar.core.link.memory import MAX_REMEMBERED_PATHS_OF_PEER
@@ -18,13 +20,11 @@ from plr.sidecar.core.path.keys import make_path_keys
 from plr.sidecar.core.wire import frame
 from plr.sidecar.core.wire.frame import Header
 from plr.sidecar.core.wire.introduction import encode_introduction
-from tests.support.mesh import Mesh, rule
-from tests.support.sessions import credential_of, seal, session_of
 
 if TYPE_CHECKING:
+    from lab.simulated.mesh import Node
     from plr.protos.model.ids import Address
     from plr.sidecar.core.link.link import Link
-    from tests.support.mesh import Node
 
 pytestmark = pytest.mark.audit("sec-1")
 

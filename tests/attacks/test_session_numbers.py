@@ -8,12 +8,12 @@ from typing import TYPE_CHECKING
 
 import pytest
 
+from lab.simulated.mesh import Mesh, rule
+from lab.simulated.sessions import session_of
 from plr.protos.model.ids import Role, Version
 from plr.protos.model.members import PeerSet
 from plr.protos.trust.credential import session_number
 from plr.protos.trust.identity import MALFORMED, CertificateError
-from tests.support.mesh import Mesh, rule
-from tests.support.sessions import session_of
 
 if TYPE_CHECKING:
     from plr.protos.trust.credential import SessionCredential

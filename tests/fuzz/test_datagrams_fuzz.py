@@ -14,10 +14,10 @@ import psutil
 import pytest
 
 from lab.attacker.junk import flipped, headed, mangled, noise
+from lab.simulated.mesh import Mesh, Node
 from plr.protos.model.ids import InterfaceName
 from plr.sidecar.core.wire.frame import HEADER_BYTES
 from tests.fuzz.test_engine_fuzz import ATTACKS, Rogue, arena, assert_bounded
-from tests.support.mesh import Mesh, Node
 
 if TYPE_CHECKING:
     from plr.protos.model.ids import Address

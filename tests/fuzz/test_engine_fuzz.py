@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from lab.simulated.mesh import SERVICE, TYPE, Mesh, Node, rule
+from lab.simulated.sessions import seal
 from plr.protos.model.ids import Role, ServiceName
 from plr.sidecar.core.base.values import PathState, Priority, RejectReason, RequestId
 from plr.sidecar.core.cloud.answers import MAX_ANSWER_BYTES, MAX_ANSWERS
@@ -26,8 +28,6 @@ from plr.sidecar.core.wire.messages import (
     ResponseMessage,
     encode_message,
 )
-from tests.support.mesh import SERVICE, TYPE, Mesh, Node, rule
-from tests.support.sessions import seal
 
 if TYPE_CHECKING:
     import random

@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, Any, Self
 
 from bench.dataplane.programs.engine import TYPE, described, peer_of
 from bench.dataplane.remote import Remote
+from lab.simulated.sessions import session_of
 from plr.protos.model.ids import InterfaceId, InterfaceName, NodeName, Role, ServiceName, SessionId, Version
 from plr.protos.model.mapping import Assignment, MappingSet, ServiceMapping
 from plr.protos.model.members import Candidate, CandidateKind, PeerSet, ServiceOffer
@@ -37,7 +38,6 @@ from plr.sidecar.core.seam.application import (
 from plr.sidecar.core.seam.links import SetReady
 from plr.sidecar.net.dataplane import DataPlaneHooks, ThreadedDataPlane
 from plr.sidecar.net.interface_thread import InterfaceThread
-from tests.support.sessions import session_of
 
 if TYPE_CHECKING:
     from collections.abc import Mapping

@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any
 import pytest
 import yaml
 
+from lab.simulated.sessions import with_credential
 from plr.protos.model.ids import InterfaceName, NodeName, Role, ServiceName, SessionId, Version
 from plr.protos.model.mapping import Assignment, MappingSet, ServiceMapping
 from plr.protos.model.members import CandidateSet, InterfaceLabel, Peer, PeerSet, Registration
@@ -24,7 +25,6 @@ from plr.protos.model.stream import Welcome
 from plr.sidecar.state.store import StateStore
 from tests.integration.scripted_control_plane import WAIT_S, ScriptedControlPlane
 from tests.support.free_ports import free_port
-from tests.support.sessions import with_credential
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

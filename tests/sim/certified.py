@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from typing import TYPE_CHECKING
 
+from lab.simulated.mesh import Mesh
 from plr.controlplane.ca import Authority
 from plr.controlplane.ca.files import write_tls_files
 from plr.protos.program.tls_files import load_tls_files
@@ -12,15 +13,14 @@ from plr.protos.trust.clock_floor import ClockFloor
 from plr.protos.trust.identity import IdentityRole
 from plr.sidecar.control.announcement import Announcer
 from plr.sidecar.state.start_session import signed, start_session
-from tests.support.mesh import Mesh
 
 if TYPE_CHECKING:
     from pathlib import Path
 
+    from lab.simulated.mesh import Node
     from plr.protos.program.tls_files import TlsFiles
     from plr.protos.trust.credential import SessionCredential
     from plr.sidecar.core.crypto.session import OwnSession
-    from tests.support.mesh import Node
 
 
 class CertifiedMesh(Mesh):

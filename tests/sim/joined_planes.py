@@ -17,11 +17,11 @@ from plr.protos.model.members import CandidateSet, PeerSet, Registration, Servic
 from plr.protos.model.stream import Ack, Heartbeat, ResourceKind, Welcome
 
 if TYPE_CHECKING:
+    from lab.simulated.mesh import Mesh, Node
     from plr.controlplane.core.policy.policy import Policy
     from plr.controlplane.core.registry.registry import StreamId
     from plr.protos.model.ids import NodeName
     from plr.protos.model.stream import ControlMessage
-    from tests.support.mesh import Mesh, Node
 
 STEP_S = 0.02
 """How often the two planes exchange what they have to say."""

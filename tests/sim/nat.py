@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from tests.support.mesh import IPV6, Mesh
+from lab.simulated.mesh import IPV6, Mesh
 
 if TYPE_CHECKING:
     from plr.protos.model.ids import Address

@@ -11,7 +11,7 @@ from plr.sidecar.core.seam.application import AbandonExecution, ApplicationEvent
 from plr.sidecar.ros.cloud.request_window import RequestWindow
 
 if TYPE_CHECKING:
-    from tests.support.mesh import Mesh, Node
+    from lab.simulated.mesh import Mesh, Node
 
 QUEUE_DEPTH = 10
 """rmw's default."""

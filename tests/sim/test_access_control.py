@@ -6,6 +6,7 @@ import dataclasses
 import functools
 from typing import TYPE_CHECKING
 
+from lab.simulated.mesh import SERVICE, TYPE, Mesh, Node, rule
 from plr.controlplane.core.control.events import Settings
 from plr.controlplane.core.policy.policy import CallRule, OfferRule, Policy
 from plr.protos.model.ids import NodeName, Role, ServiceName
@@ -13,7 +14,6 @@ from plr.protos.model.members import ServiceOffer
 from plr.sidecar.core.robot.request.service_catalog import WITHDRAW_AFTER_S
 from plr.sidecar.core.seam.application import CallsForbidden, ExecuteRequest, RequestFailed, WithdrawService
 from tests.sim.joined_planes import JoinedPlanes, restored
-from tests.support.mesh import SERVICE, TYPE, Mesh, Node, rule
 
 if TYPE_CHECKING:
     from plr.sidecar.core.base.values import RequestId

@@ -14,8 +14,8 @@ from tests.sim.test_sealing import dropped, pair
 if TYPE_CHECKING:
     from collections.abc import Callable
 
+    from lab.simulated.mesh import Mesh, Node
     from plr.protos.model.ids import Address
-    from tests.support.mesh import Mesh, Node
 
 ELSEWHERE: Address = ("attacker.eth0", 666)
 

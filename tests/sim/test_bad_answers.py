@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
+from lab.simulated.mesh import Mesh, Node, rule
 from plr.sidecar.core.seam.application import DeadlineMissed, RequestFailed
-from tests.support.mesh import Mesh, Node, rule
 
 GARBAGE = b"garbage"
 REQUESTS = 200

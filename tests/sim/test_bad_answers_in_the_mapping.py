@@ -6,11 +6,11 @@ from typing import TYPE_CHECKING
 
 import pytest
 
+from lab.simulated.mesh import SERVICE, Mesh, Node, rule
 from plr.controlplane.cli.explanation_text import render
 from plr.protos.model.ids import Role
 from plr.sidecar.core.robot.dispatch.penalties import FIRST_S, LONGEST_S
 from tests.sim.joined_planes import JoinedPlanes
-from tests.support.mesh import SERVICE, Mesh, Node, rule
 
 if TYPE_CHECKING:
     from plr.protos.model.ids import NodeName

@@ -7,8 +7,8 @@ from statistics import median
 
 import pytest
 
+from lab.simulated.mesh import Mesh, Node, rule
 from plr.protos.model.ids import Role
-from tests.support.mesh import Mesh, Node, rule
 
 MBIT = 1e6 / 8
 ONE_WAY_S = 0.025

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import pytest
 
+from lab.simulated.mesh import SERVICE, Mesh, Node
 from plr.protos.model.ids import InterfaceName, NodeName
 from plr.sidecar.core.base import request_id as identity
 from plr.sidecar.core.base.request_id import OBSERVED_ONE_IN
 from plr.sidecar.core.base.values import PathState
 from tests.sim.serial_server import SerialServer
 from tests.sim.test_mesh import assert_at_most_once, assert_each_answered_once, call_at, mapped, two_by_two
-from tests.support.mesh import SERVICE, Mesh, Node
 
 
 def split(*, deadline_s: float = 0.1, lifetime_s: float = 10.0) -> tuple[Mesh, Node, Node, Node]:

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import pytest
 
+from lab.simulated.mesh import SERVICE, TYPE, Mesh, Node, rule
 from plr.protos.model.ids import Role
 from plr.protos.model.members import ServiceOffer
 from plr.sidecar.core.cloud import answers as answers_module
 from plr.sidecar.core.seam.application import RequestFailed
 from plr.sidecar.core.transfer import room as room_module
 from plr.sidecar.core.transfer.room import SMALL_BYTES, Lane
-from tests.support.mesh import SERVICE, TYPE, Mesh, Node, rule
 
 pytestmark = pytest.mark.audit("dp-1")
 MBIT = 1e6 / 8

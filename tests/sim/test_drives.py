@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import pytest
 
+from bench.drives.simulation import drive
 from bench.evaluation.scenario import Scenario, read_scenarios
 from plr.protos.model.redundancy_mode import RedundancyMode
 from plr.sidecar.core.rules.budget import Budget
-from tests.sim.drives import drive
 
 
 @pytest.fixture
@@ -28,4 +28,6 @@ def test_adaptive_avoids_what_replicate_avoids_for_a_fraction_of_its_bytes(scena
 
 def test_adaptive_keeps_its_budget(scenario: Scenario) -> None:
     run = drive(scenario, RedundancyMode.ADAPTIVE, budget=Budget("*", extra_load=0.05))
-    assert 0.03 * run.first < run.extra <= 2 * 0.05 * run.first, "each of two interfaces may spend a twentieth"
+    assert 0.03 * run.copies.first < run.copies.extra <= 2 * 0.05 * run.copies.first, (
+        "each of two interfaces may spend a twentieth"
+    )

@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING
 
 import pytest
 
+from lab.simulated.mesh import IPV6, Mesh, Node
 from plr.sidecar.core.wire.frame import BASE_BYTES
-from tests.support.mesh import IPV6, Mesh, Node
 
 if TYPE_CHECKING:
     from plr.protos.model.ids import Address

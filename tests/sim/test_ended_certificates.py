@@ -12,8 +12,8 @@ from plr.sidecar.core.seam.links import SetCredential
 from tests.sim.test_sealing import pair
 
 if TYPE_CHECKING:
+    from lab.simulated.mesh import Mesh, Node
     from plr.protos.trust.credential import SessionCredential
-    from tests.support.mesh import Mesh, Node
 
 pytestmark = pytest.mark.audit("sec-6")
 

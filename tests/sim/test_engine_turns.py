@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
+from lab.simulated.mesh import TYPE, Mesh, Node, rule
 from plr.protos.model.ids import InterfaceName, ServiceName, Version
 from plr.protos.model.members import PeerSet, RemovalReason, RemovedPeer, ServiceOffer
 from plr.protos.model.redundancy_mode import RedundancyMode
@@ -18,7 +19,6 @@ from plr.sidecar.core.engine.engine import Engine
 from plr.sidecar.core.robot.request_table import RequestTable
 from plr.sidecar.core.seam.application import RequestFailed
 from plr.sidecar.core.seam.links import SetCarrier
-from tests.support.mesh import TYPE, Mesh, Node, rule
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator

@@ -6,16 +6,16 @@ from collections import Counter
 from functools import partial
 from typing import TYPE_CHECKING
 
+from lab.simulated.mesh import SERVICE, Mesh, rule
 from plr.protos.model.ids import Role, ServiceName
 from plr.sidecar.core.robot.fallback.fallbacks import Fallbacks
 from plr.sidecar.core.rules.service_rule import FallbackRule
 from plr.sidecar.core.seam.application import DeadlineMissed, RequestFailed, ResponseArrived, Unreachable
-from tests.support.mesh import SERVICE, Mesh, rule
 
 if TYPE_CHECKING:
+    from lab.simulated.mesh import Node
     from plr.sidecar.core.base.values import RequestId
     from plr.sidecar.core.seam.application import ApplicationEvent
-    from tests.support.mesh import Node
 
 DEADLINE_S = 0.5
 TAKES_S = 0.08

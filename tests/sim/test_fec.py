@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 
 import pytest
 
+from lab.simulated.mesh import Mesh, Node, rule
 from plr.protos.model.ids import Role
-from tests.support.mesh import Mesh, Node, rule
 
 if TYPE_CHECKING:
     from collections.abc import Callable

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import pytest
 
+from lab.simulated.mesh import Mesh, rule
 from plr.sidecar.core.link import sender
 from plr.sidecar.core.seam.links import LinkCommand, SendFinished
-from tests.support.mesh import Mesh, rule
 
 pytestmark = pytest.mark.audit("dp-8")
 

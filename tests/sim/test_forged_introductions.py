@@ -6,16 +6,16 @@ from typing import TYPE_CHECKING
 
 import pytest
 
+from lab.simulated.mesh import Mesh, rule
 from plr.protos.model.ids import InterfaceId, InterfaceName, NodeName, Role
 from plr.sidecar.core.wire.frame import Header
 from plr.sidecar.core.wire.introduction import encode_introduction
 from tests.sim.joined_planes import JoinedPlanes
-from tests.support.mesh import Mesh, rule
 
 if TYPE_CHECKING:
+    from lab.simulated.mesh import Node
     from plr.protos.model.ids import Address
     from plr.protos.model.members import Peer, PeerSet
-    from tests.support.mesh import Node
 
 pytestmark = pytest.mark.audit("sec-5")
 

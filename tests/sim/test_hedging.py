@@ -8,7 +8,7 @@ from plr.protos.model.ids import InterfaceName
 from tests.sim.test_mesh import assert_at_most_once, assert_each_answered_once, call_at, mapped, two_by_two
 
 if TYPE_CHECKING:
-    from tests.support.mesh import Mesh, Node
+    from lab.simulated.mesh import Mesh, Node
 
 
 def wwan_only(*, deadline_s: float = 0.3) -> tuple[Mesh, Node, Node, Node]:

@@ -21,7 +21,7 @@ from tests.fuzz.test_engine_fuzz import Rogue, arena, assert_bounded
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from tests.support.mesh import Mesh, Node
+    from lab.simulated.mesh import Mesh, Node
 
 CAP = 300
 """What the tables that the floods fill may hold here, instead of thousands."""

@@ -7,13 +7,13 @@ from typing import TYPE_CHECKING
 
 import pytest
 
+from lab.simulated.mesh import Mesh, Node, rule
 from plr.protos.model.ids import Role
 from plr.protos.model.redundancy_mode import RedundancyMode
 from plr.sidecar.core.base.values import PathState
 from plr.sidecar.core.link.liveness import PathKeeper
 from plr.sidecar.core.path.probing import IDLE_PROBE_S, IDLE_SPREAD, MAX_IDLE_PROBE_S, WATCH_FACTOR
 from tests.sim.test_mesh import assert_each_answered_once, mapped, two_by_two
-from tests.support.mesh import Mesh, Node, rule
 
 if TYPE_CHECKING:
     from plr.sidecar.core.link.link import Link

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import pytest
 
+from lab.simulated.mesh import SERVICE, TYPE, Mesh, Node, rule
 from plr.protos.model.members import ServiceOffer
 from plr.protos.model.redundancy_mode import RedundancyMode
 from plr.sidecar.core.base.values import RejectReason
 from plr.sidecar.core.robot.request.service_catalog import WITHDRAW_AFTER_S
 from plr.sidecar.core.seam.application import ApplicationEvent, ExecuteRequest, RequestFailed, WithdrawService
 from tests.sim.test_mesh import call_at, mapped
-from tests.support.mesh import SERVICE, TYPE, Mesh, Node, rule
 
 SERVERLESS_S = 3.0
 

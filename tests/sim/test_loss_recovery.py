@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
+from lab.simulated.mesh import Mesh, Node
 from tests.sim.test_mesh import assert_at_most_once, assert_each_answered_once, call_at, mapped
-from tests.support.mesh import Mesh, Node
 
 LARGE = 200_000
 

@@ -7,13 +7,13 @@ from collections import Counter
 
 import pytest
 
+from lab.simulated.mesh import SERVICE, Mesh, Node, rule
 from plr.protos.model.ids import InterfaceName, NodeName, Version
 from plr.protos.model.mapping import Assignment, MappingSet, ServiceMapping
 from plr.protos.model.members import Peer, PeerSet
 from plr.sidecar.core.path.path import DOWN_FLOOR_S
 from plr.sidecar.core.path.probing import FIRST_PROBE_S
 from plr.sidecar.core.seam.application import DeadlineMissed, OfferService, RequestFailed, WithdrawService
-from tests.support.mesh import SERVICE, Mesh, Node, rule
 
 
 def two_by_two(seed: int = 1, **rule_changes: object) -> tuple[Mesh, Node, Node, Node]:

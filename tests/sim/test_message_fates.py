@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
+from lab.simulated.mesh import Mesh, Node, rule
 from plr.sidecar.core.message.reassembly import MAX_SILENCE_S
 from plr.sidecar.core.path.pmtu import HEADERS_V4
 from plr.sidecar.core.wire.frame import BASE_BYTES
 from tests.sim.test_mesh import mapped, two_by_two
-from tests.support.mesh import Mesh, Node, rule
 
 SIZE = 2_000_000
 BYTES_PER_S = 1_000_000.0

@@ -8,11 +8,11 @@ from typing import TYPE_CHECKING
 
 import pytest
 
+from lab.simulated.mesh import SERVICE, Mesh, Node, rule
 from plr.protos.model.redundancy_mode import RedundancyMode
 from plr.sidecar.core.rules.budget import Budget
 from tests.sim.joined_planes import JoinedPlanes
 from tests.sim.test_redundancy_modes import stall
-from tests.support.mesh import SERVICE, Mesh, Node, rule
 
 if TYPE_CHECKING:
     from plr.controlplane.core.explain.fleet_view import MissView

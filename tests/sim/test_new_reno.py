@@ -7,9 +7,9 @@ from __future__ import annotations
 
 import pytest
 
+from lab.simulated.mesh import Mesh, rule
 from tests.sim.bottleneck import Bottleneck, OurFlow, Tcp
 from tests.sim.test_mesh import mapped
-from tests.support.mesh import Mesh, rule
 
 MBIT = 1e6 / 8
 SIZE = 120_000

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import pytest
 from cryptography.hazmat.primitives.ciphers.aead import AESGCM, ChaCha20Poly1305
 
+from lab.simulated.mesh import Mesh, Node
 from plr.protos.model.ids import Version
 from plr.protos.model.members import PeerSet
 from plr.protos.trust.credential import Aead
@@ -16,7 +17,6 @@ from plr.sidecar.core.link.link import Link
 from plr.sidecar.core.path.key_exchange import KeyLimits
 from plr.sidecar.core.seam.links import ResetPaths, SetPeers, SetReady
 from plr.sidecar.core.wire import introduction
-from tests.support.mesh import Mesh, Node
 
 if TYPE_CHECKING:
     from plr.protos.model.ids import InterfaceName

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import pytest
 
+from lab.simulated.mesh import Mesh, rule
 from plr.protos.model.ids import NodeName
 from plr.sidecar.core.base.values import PathState
 from plr.sidecar.core.path.probing import FIRST_PROBE_S
 from tests.sim.test_mesh import mapped
-from tests.support.mesh import Mesh, rule
 
 SIZE = 120_000
 EVERY_S = 0.2

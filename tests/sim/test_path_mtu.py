@@ -6,12 +6,12 @@ from functools import partial
 
 import pytest
 
+from lab.simulated.mesh import Mesh, Node, rule
 from plr.protos.model.ids import InterfaceName, NodeName
 from plr.sidecar.core.path.pmtu import RETRY_S
 from plr.sidecar.core.seam.links import SetMtu
 from plr.sidecar.core.wire.frame import BASE_BYTES, MAX_DATAGRAM_BYTES
 from tests.sim.test_mesh import assert_at_most_once, assert_each_answered_once, call_at, mapped
-from tests.support.mesh import Mesh, Node, rule
 
 CLOUD = NodeName("cloud-a")
 

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import pytest
 
+from lab.simulated.mesh import Mesh, rule
 from plr.protos.model.ids import Role
 from plr.protos.model.redundancy_mode import RedundancyMode
 from tests.sim.serial_server import SerialServer
-from tests.support.mesh import Mesh, rule
 
 
 @pytest.mark.audit("dp-10")

@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import pytest
 
+from lab.simulated.mesh import Mesh, rule
 from tests.sim.bottleneck import Bottleneck, OurFlow, Policed
-from tests.support.mesh import Mesh, rule
 
 if TYPE_CHECKING:
     from collections.abc import Callable

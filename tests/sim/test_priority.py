@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
+from lab.simulated.mesh import SERVICE, TYPE, Mesh, rule
 from plr.protos.model.ids import ServiceName
 from plr.protos.model.members import ServiceOffer
 from plr.sidecar.core.base.values import Priority
 from tests.sim.test_mesh import assert_each_answered_once
-from tests.support.mesh import SERVICE, TYPE, Mesh, rule
 
 BULK = ServiceName("/bulk")
 

@@ -8,12 +8,12 @@ from dataclasses import dataclass
 
 import pytest
 
+from lab.simulated.mesh import SERVICE, Mesh, Node, Wire, rule
 from plr.controlplane.core.estimate.estimator import Estimator
 from plr.protos.model.ids import InterfaceName
 from plr.protos.model.redundancy_mode import RedundancyMode
 from plr.sidecar.core.rules.budget import Budget
 from tests.sim.test_mesh import assert_at_most_once, assert_each_answered_once, call_at, mapped
-from tests.support.mesh import SERVICE, Mesh, Node, Wire, rule
 
 DEADLINE_S = 0.2
 SECONDS = 45.0

@@ -6,10 +6,10 @@ from functools import partial
 
 import pytest
 
+from lab.simulated.mesh import Mesh, rule
 from plr.sidecar.core.base.values import RejectReason
 from plr.sidecar.core.robot.dispatch.dispatcher import MAX_COPIES_OF_REQUEST, MAX_COPIES_WHILE_REFUSED
 from plr.sidecar.core.seam.application import ApplicationEvent, ExecuteRequest, RequestFailed
-from tests.support.mesh import Mesh, rule
 
 
 @pytest.mark.audit("dp-14")

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import pytest
 
+from lab.simulated.mesh import TYPE, Mesh, rule
 from plr.protos.model.ids import Role, ServiceName
 from plr.protos.model.members import ServiceOffer
 from plr.protos.model.redundancy_mode import RedundancyMode
 from plr.sidecar.core.base.values import Priority
 from plr.sidecar.core.transfer import room as room_module
 from plr.sidecar.core.transfer.room import SMALL_BYTES, Lane
-from tests.support.mesh import TYPE, Mesh, rule
 
 SIZE = 400_000
 

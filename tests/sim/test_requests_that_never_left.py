@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import pytest
 
+from lab.simulated.mesh import SERVICE, Mesh, Node, rule
 from plr.sidecar.core.seam.application import RequestFailed
 from plr.sidecar.core.transfer.room import Lane
-from tests.support.mesh import SERVICE, Mesh, Node, rule
 
 pytestmark = pytest.mark.audit("dp-7")
 BYTES_PER_S = 250_000.0

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
+from lab.simulated.mesh import Mesh, rule
 from plr.controlplane.ca.authority import Authority
 from plr.controlplane.ca.files import write_atomically, write_tls_files
 from plr.protos.model.ids import Role
@@ -19,16 +20,15 @@ from plr.sidecar.core.base.values import Priority
 from plr.sidecar.core.engine.revocation_exchange import ASK_NEXT_AFTER_S, MAX_SENDING_BYTES
 from plr.sidecar.core.seam.links import SetCredential
 from plr.sidecar.core.wire.messages import RevocationLists, RevocationsHeld, RevocationsWanted, encode_message
-from tests.support.mesh import Mesh, rule
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
     from pathlib import Path
 
+    from lab.simulated.mesh import Node
     from plr.protos.model.ids import NodeName
     from plr.protos.trust.credential import SessionCredential
     from plr.sidecar.core.wire.messages import RevocationMessage
-    from tests.support.mesh import Node
 
 pytestmark = pytest.mark.audit("sec-12")
 

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import pytest
 
+from lab.simulated.mesh import rule
 from plr.sidecar.core.seam.application import RequestFailed
 from tests.sim.nat import NatMesh
 from tests.sim.test_mesh import mapped
-from tests.support.mesh import rule
 
 pytestmark = pytest.mark.audit("dp-16")
 

@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING
 
 import pytest
 
+from lab.simulated.mesh import Mesh, Node
+from lab.simulated.sessions import credential_of
 from plr.protos.base.errors import DecodeError
 from plr.protos.model.ids import InterfaceId, Version
 from plr.protos.model.members import PeerSet
@@ -16,8 +18,6 @@ from plr.sidecar.core.path.key_exchange import KeyLimits
 from plr.sidecar.core.wire import frame
 from plr.sidecar.core.wire.introduction import encode_introduction
 from tests.sim.test_mesh import assert_each_answered_once
-from tests.support.mesh import Mesh, Node
-from tests.support.sessions import credential_of
 
 if TYPE_CHECKING:
     from plr.protos.trust.credential import SessionCredential

@@ -6,9 +6,9 @@ from typing import TYPE_CHECKING
 
 import pytest
 
+from lab.simulated.mesh import SERVICE, Mesh, Node, rule
 from plr.protos.model.ids import InterfaceName, NodeName, Version
 from plr.protos.model.mapping import Assignment, MappingSet, ServiceMapping
-from tests.support.mesh import SERVICE, Mesh, Node, rule
 
 if TYPE_CHECKING:
     from plr.sidecar.core.base.values import ExecutionId

@@ -16,9 +16,9 @@ if TYPE_CHECKING:
     from collections.abc import Callable
     from pathlib import Path
 
+    from lab.simulated.mesh import Mesh, Node
     from plr.protos.model.ids import Address
     from plr.protos.model.members import Peer
-    from tests.support.mesh import Mesh, Node
 
 pytestmark = pytest.mark.audit("sec-5")
 

@@ -6,10 +6,10 @@ from typing import TYPE_CHECKING
 
 import pytest
 
+from lab.simulated.mesh import Mesh, Node, Wire, rule
 from plr.sidecar.core.base.values import PathState
 from plr.sidecar.core.path.probing import MAX_PROBE_S
 from tests.sim.test_mesh import assert_at_most_once, assert_each_answered_once
-from tests.support.mesh import Mesh, Node, Wire, rule
 
 if TYPE_CHECKING:
     from plr.sidecar.core.path.path import Path

@@ -14,14 +14,14 @@ import pytest
 from cryptography.exceptions import InvalidTag
 from cryptography.hazmat.primitives.asymmetric.x25519 import X25519PrivateKey, X25519PublicKey
 
+from lab.simulated.mesh import Mesh, Node
+from lab.simulated.sessions import private_key
 from plr.sidecar.core.base.values import PathState
 from plr.sidecar.core.crypto.aead import KEY_BYTES, TAG_BYTES, make_cipher
 from plr.sidecar.core.path.key_exchange import KeyLimits
 from plr.sidecar.core.wire.frame import CLEAR, HEADER_BYTES, INTRODUCTION_FLAG, NONCE_OFFSET, decode_header
 from tests.sim.test_mesh import assert_each_answered_once
 from tests.sim.test_sealing import dropped, phases
-from tests.support.mesh import Mesh, Node
-from tests.support.sessions import private_key
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
+from lab.simulated.mesh import SERVICE, TYPE, Mesh, rule
 from plr.protos.model.ids import InterfaceId, InterfaceName, Role
 from plr.protos.model.members import Candidate, CandidateKind
 from plr.sidecar.core.base.request_id import make_request_id
@@ -18,13 +19,12 @@ from plr.sidecar.core.link.path_table import UNPROVEN_BYTES, UNPROVEN_BYTES_PER_
 from plr.sidecar.core.path.address import AMPLIFICATION
 from plr.sidecar.core.wire import frame
 from plr.sidecar.core.wire.messages import RequestMessage, encode_message
-from tests.support.mesh import SERVICE, TYPE, Mesh, rule
 
 if TYPE_CHECKING:
+    from lab.simulated.mesh import Node
     from plr.protos.model.ids import Address
     from plr.protos.model.members import Peer
     from plr.sidecar.core.path.path import Path
-    from tests.support.mesh import Node
 
 pytestmark = pytest.mark.audit("sec-5")
 

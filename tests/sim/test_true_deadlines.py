@@ -6,13 +6,13 @@ from typing import TYPE_CHECKING
 
 import pytest
 
+from lab.simulated.mesh import Mesh, Node, Wire, rule
 from plr.protos.model.ids import Role
 from plr.sidecar.core.base.values import Priority
 from plr.sidecar.core.path.pmtu import HEADERS_V4
 from plr.sidecar.core.seam.application import ExecuteRequest
 from plr.sidecar.core.wire.frame import BASE_BYTES
 from tests.sim.serial_server import SerialServer
-from tests.support.mesh import Mesh, Node, Wire, rule
 
 if TYPE_CHECKING:
     from plr.sidecar.core.message.repair import Redundancy

@@ -6,6 +6,7 @@ import random
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
+from lab.simulated.sessions import agree, credential_of, seal, session_of, with_credential
 from plr.protos.model.ids import Address, InterfaceId, InterfaceName, NodeName, Role, ServiceName, SessionId
 from plr.protos.model.members import ALL_CALLS, Candidate, CandidateKind, Peer, ServiceOffer
 from plr.protos.trust.pair_token import pair_token
@@ -32,7 +33,6 @@ from plr.sidecar.core.wire.frame import (
 )
 from plr.sidecar.core.wire.introduction import Introduction, encode_introduction, open_introduction
 from plr.sidecar.core.wire.messages import Encoded, RequestMessage
-from tests.support.sessions import agree, credential_of, seal, session_of, with_credential
 
 if TYPE_CHECKING:
     from collections.abc import Iterable

@@ -11,6 +11,7 @@ import time
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
+from lab.simulated.sessions import session_of
 from plr.protos.model.ids import InterfaceId, InterfaceName, NodeName, Role, ServiceName, SessionId, Version
 from plr.protos.model.members import ALL_CALLS, Candidate, CandidateKind, Peer, PeerSet, ServiceOffer
 from plr.protos.trust.pair_token import pair_token
@@ -23,7 +24,6 @@ from plr.sidecar.core.seam.application import ApplicationEvent, ExecuteRequest, 
 from plr.sidecar.core.seam.links import SetReady
 from plr.sidecar.net.dataplane import DataPlaneHooks, ThreadedDataPlane
 from plr.sidecar.net.interface_thread import InterfaceThread
-from tests.support.sessions import session_of
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

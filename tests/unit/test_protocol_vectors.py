@@ -23,6 +23,7 @@ from cryptography.hazmat.primitives.asymmetric.x25519 import X25519PrivateKey, X
 from cryptography.hazmat.primitives.ciphers.aead import AESGCM, ChaCha20Poly1305
 from cryptography.hazmat.primitives.serialization import Encoding
 
+from lab.simulated.sessions import seal
 from plr.protos.base.errors import DecodeError
 from plr.protos.model.ids import PROTOCOL_VERSION, InterfaceId, InterfaceName, NodeName, Role, ServiceName
 from plr.protos.model.members import Candidate, CandidateKind
@@ -44,7 +45,6 @@ from plr.sidecar.core.path.keys import LATE_S, MAX_FAILED, PathKeys, make_path_k
 from plr.sidecar.core.transfer import outbox
 from plr.sidecar.core.wire import fec, frame, introduction, messages
 from plr.sidecar.core.wire.frame import Header
-from tests.support.sessions import seal
 
 if TYPE_CHECKING:
     from collections.abc import Callable

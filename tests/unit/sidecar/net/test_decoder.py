@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
+from lab.simulated.sessions import session_of
 from plr.protos.model.ids import InterfaceName, Role, SessionId, Version
 from plr.protos.model.members import PeerSet, ServiceOffer
 from plr.sidecar.core.base.values import Priority
@@ -22,7 +23,6 @@ from plr.sidecar.core.wire.messages import RequestMessage, encode_message
 from plr.sidecar.net.dataplane import DataPlaneHooks, ThreadedDataPlane
 from plr.sidecar.net.decoder import Decoder
 from tests.support.builders import ECHO, TYPE, path, peer, request_id, rule
-from tests.support.sessions import session_of
 
 if TYPE_CHECKING:
     from plr.sidecar.core.seam.application import ApplicationEvent

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
+from lab.simulated.sessions import session_of
 from plr.protos.model.ids import InterfaceName, Role
 from plr.sidecar.config.service import ServiceConfig
 from plr.sidecar.config.sidecar import SidecarConfig, StunConfig
@@ -16,7 +17,6 @@ from plr.sidecar.net import interface_manager as module
 from plr.sidecar.net.interface_manager import InterfaceManager
 from plr.sidecar.net.interfaces import Interface
 from plr.sidecar.net.netlink_watch import Changes
-from tests.support.sessions import session_of
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

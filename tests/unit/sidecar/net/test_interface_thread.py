@@ -6,13 +6,13 @@ import threading
 import time
 from typing import TYPE_CHECKING, Any
 
+from lab.simulated.sessions import credential_of
 from plr.protos.model.ids import InterfaceId, InterfaceName, Role
 from plr.sidecar.core.link.link import Link
 from plr.sidecar.core.link.sender import Batch, LinkIdentity
 from plr.sidecar.core.stun.client import StunClient
 from plr.sidecar.core.stun.events import Mapped
 from plr.sidecar.net.interface_thread import InterfaceThread
-from tests.support.sessions import credential_of
 
 if TYPE_CHECKING:
     import pytest

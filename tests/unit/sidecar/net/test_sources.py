@@ -6,6 +6,7 @@ import time
 
 import pytest
 
+from lab.simulated.sessions import credential_of
 from plr.protos.model.ids import InterfaceId, InterfaceName, NodeName, Role
 from plr.sidecar.core.base.values import PathId, PathState
 from plr.sidecar.core.link.link import Link
@@ -13,7 +14,6 @@ from plr.sidecar.core.link.sender import LinkIdentity
 from plr.sidecar.core.seam.links import PathChanged
 from plr.sidecar.net.interface_thread import InterfaceThread
 from plr.sidecar.net.sources import Sources
-from tests.support.sessions import credential_of
 from tests.unit.sidecar.net.test_interface_thread import Owner
 
 pytestmark = pytest.mark.audit("dp-14")

@@ -6,9 +6,9 @@ from functools import partial
 
 import pytest
 
+from lab.simulated.mesh import Mesh, rule
 from plr.sidecar.core.base.slices import SLICE, Backlog
 from plr.sidecar.core.seam.application import RequestFailed
-from tests.support.mesh import Mesh, rule
 
 pytestmark = pytest.mark.audit("dp-10")
 

@@ -7,11 +7,11 @@ from cryptography.hazmat.primitives.asymmetric.x25519 import X25519PrivateKey
 from hypothesis import given
 from hypothesis import strategies as st
 
+from lab.simulated.sessions import session_of, with_credential
 from plr.protos.model.ids import InterfaceId, NodeName, Role, SessionId
 from plr.protos.trust.credential import Aead, SessionCredential
 from plr.sidecar.core.crypto.key_schedule import PairKeys, next_root, pair_keys, proof
 from tests.support.builders import peer
-from tests.support.sessions import session_of, with_credential
 
 OURS, THEIRS = (X25519PrivateKey.from_private_bytes(bytes([number]) * 32) for number in (1, 2))
 ROBOT = SessionCredential(NodeName("robot-1"), Role.ROBOT, SessionId(1), 2, bytes(range(32)), Aead.AES_256_GCM)

@@ -5,13 +5,13 @@ from typing import TYPE_CHECKING
 
 import pytest
 
+from lab.simulated.sessions import credential_of, private_key, session_of
 from plr.protos.base.errors import DecodeError
 from plr.protos.model.ids import NodeName, Role, SessionId
 from plr.protos.trust.credential import SessionCredential, decode_credential
 from plr.sidecar.core.crypto import session as session_module
 from plr.sidecar.core.crypto.session import OwnSession
 from tests.support.builders import A, B, peer
-from tests.support.sessions import credential_of, private_key, session_of
 
 if TYPE_CHECKING:
     from plr.protos.model.members import Peer

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pytest
 
+from lab.simulated.sessions import credential_of
 from plr.protos.model.ids import Role, SessionId, Version
 from plr.protos.model.members import PeerSet, RemovalReason, RemovedPeer
 from plr.sidecar.core.base.values import ExecutionId, PathState
@@ -12,7 +13,6 @@ from plr.sidecar.core.seam.application import CancelExecution, ResponseArrived, 
 from plr.sidecar.core.seam.links import FragmentsLost, PeerClosed, PeerRestarted, Resend, SetPeers
 from plr.sidecar.core.wire.messages import ResponseMessage
 from tests.support.builders import ECHO, A, peer, request, request_id
-from tests.support.sessions import credential_of
 from tests.unit.sidecar.core.engine.test_engine import ROBOT, Sidecar, cloud, robot
 
 

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
+from lab.simulated.sessions import session_of
 from plr.protos.model.ids import InterfaceId, InterfaceName, NodeName, Role, Version
 from plr.protos.model.members import Candidate, CandidateKind, Peer, PeerSet
 from plr.protos.trust.candidate_signature import sign_candidates, verify_candidates
@@ -20,7 +21,6 @@ from plr.sidecar.core.engine.announced import Announced
 from plr.sidecar.core.engine.peers import Peers
 from plr.sidecar.state.start_session import start_session
 from tests.support.builders import peer
-from tests.support.sessions import session_of
 from tests.unit.sidecar.state.test_start_session import Fleet
 
 if TYPE_CHECKING:

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import pytest
 
+from lab.simulated.sessions import credential_of, session_of
 from plr.protos.model.ids import InterfaceName, NodeName, Role, ServiceName, SessionId, Version
 from plr.protos.model.mapping import Assignment, MappingSet, ServiceMapping
 from plr.protos.model.members import Peer, PeerSet, ServiceOffer, ServiceUse
@@ -48,7 +49,6 @@ from plr.sidecar.core.wire.messages import (
     encode_message,
 )
 from tests.support.builders import ECHO, TYPE, WLAN, WWAN, A, B, path, peer, request, request_id, rule
-from tests.support.sessions import credential_of, session_of
 
 ROBOT = NodeName("robot")
 

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
+from lab.simulated.sessions import credential_of, private_key, session_of, with_credential
 from plr.protos.base.errors import DecodeError
 from plr.protos.model.ids import InterfaceId, InterfaceName, NodeName, Role, ServiceName, SessionId, Version
 from plr.protos.model.members import (
@@ -27,7 +28,6 @@ from plr.sidecar.core.crypto.session import OwnSession
 from plr.sidecar.core.engine.peers import RESTART_GAP_S, Peers
 from plr.sidecar.core.seam.links import PeerRestarted
 from tests.support.builders import ECHO, A, B, peer
-from tests.support.sessions import credential_of, private_key, session_of, with_credential
 
 if TYPE_CHECKING:
     from plr.protos.trust.credential import SessionCredential

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
+from lab.simulated.sessions import credential_of, private_key
 from plr.protos.base.errors import DecodeError
 from plr.protos.model.ids import NodeName, Role, SessionId, Version
 from plr.protos.model.members import POLICY_PENDING, PeerSet
@@ -20,7 +21,6 @@ from plr.sidecar.core.engine.peers import Peers
 from plr.sidecar.core.engine.verification_budget import ALL_LOOKS_AT_ONCE, ALL_LOOKS_PER_S, LOOKS_AT_ONCE, LOOKS_PER_S
 from plr.sidecar.core.seam.links import PeerRenewed, PeerRestarted
 from tests.support.builders import A, B, peer
-from tests.support.sessions import credential_of, private_key
 
 if TYPE_CHECKING:
     from collections.abc import Callable

@@ -4,6 +4,7 @@ import random
 
 import pytest
 
+from lab.simulated.sessions import credential_of
 from plr.protos.model.ids import InterfaceId, InterfaceName, NodeName, Role, SessionId
 from plr.sidecar.core.base.values import PathId, PathState
 from plr.sidecar.core.link.link import Link
@@ -40,7 +41,6 @@ from tests.support.builders import (
     Bench,
     message,
 )
-from tests.support.sessions import credential_of
 
 PATH = PathId(WLAN, A, InterfaceId(0))
 OTHER_SESSION = SessionId(99)

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
+from lab.simulated.sessions import credential_of, seal, session_of
 from plr.protos.base.errors import DecodeError
 from plr.protos.model.ids import InterfaceId, NodeName, Role, SessionId
 from plr.sidecar.core.link.link import Link
@@ -20,7 +21,6 @@ from plr.sidecar.core.wire import frame
 from plr.sidecar.core.wire.frame import BASE_BYTES, Header, KeyAnswer, KeyOffer, Probe, ProbeReply
 from plr.sidecar.core.wire.introduction import encode_introduction
 from tests.support.builders import OUR_ID, OUR_TOKEN, PEER_ADDRESS, WLAN, Bench, peer
-from tests.support.sessions import credential_of, seal, session_of
 from tests.unit.sidecar.core.link.test_link import PROBE, fragment, up
 
 if TYPE_CHECKING:

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import pytest
 
+from lab.simulated.sessions import session_of
 from plr.protos.model.ids import InterfaceId, NodeName, Role, SessionId
 from plr.sidecar.core.link import memory as link_memory
 from plr.sidecar.core.link.memory import MAX_REMEMBERED_PATHS_OF_PEER, LinkMemory
 from plr.sidecar.core.path.key_exchange import DEFAULT_LIMITS
 from plr.sidecar.core.path.keys import PathKeys, make_path_keys
 from tests.support.builders import peer
-from tests.support.sessions import session_of
 
 pytestmark = pytest.mark.audit("sec-1")
 

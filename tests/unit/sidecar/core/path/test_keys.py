@@ -6,6 +6,7 @@ from typing import Any
 import pytest
 from cryptography.exceptions import InvalidTag
 
+from lab.simulated.sessions import agree, session_of, with_credential
 from plr.protos.base.errors import DecodeError
 from plr.protos.model.ids import InterfaceId, Role
 from plr.protos.trust.credential import Aead
@@ -15,7 +16,6 @@ from plr.sidecar.core.path.key_exchange import OTHER_OFFER_AFTER_S, KeyLimits
 from plr.sidecar.core.path.keys import LATE_S, OpeningKeys, PathKeys, make_path_keys
 from plr.sidecar.core.wire.frame import CLEAR, HEADER_BYTES, NONCE_OFFSET, PHASE_FLAG, KeyAnswer, KeyOffer
 from tests.support.builders import peer
-from tests.support.sessions import agree, session_of, with_credential
 
 LIMITS = KeyLimits(datagrams=10, seconds=5.0)
 HEAD = 0xD3010002

@@ -4,6 +4,7 @@ import random
 
 import pytest
 
+from lab.simulated.sessions import agree, session_of, with_credential
 from plr.protos.base.token_bucket import TokenBucket
 from plr.protos.model.ids import Address, InterfaceId, Role, SessionId
 from plr.sidecar.core.base.values import PathState
@@ -14,7 +15,6 @@ from plr.sidecar.core.path.keys import make_path_keys
 from plr.sidecar.core.path.path import DOWN_FACTOR, DOWN_FLOOR_S, Path
 from plr.sidecar.core.path.probing import FIRST_PROBE_S, IDLE_PROBE_S, MAX_PROBE_S
 from tests.support.builders import path, peer
-from tests.support.sessions import agree, session_of, with_credential
 
 RNG = random.Random(1)
 HERE, THERE, ELSEWHERE = ("192.0.2.1", 1), ("192.0.2.2", 2), ("192.0.2.3", 3)

@@ -6,6 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from lab.simulated.sessions import credential_of
 from plr.protos.base.errors import DecodeError
 from plr.protos.model.ids import InterfaceId, NodeName, Role, SessionId
 from plr.sidecar.core.wire.frame import BASE_BYTES, Header, KeyOffer
@@ -18,7 +19,6 @@ from plr.sidecar.core.wire.introduction import (
     open_introduction,
     read_hello_id,
 )
-from tests.support.sessions import credential_of
 
 TOKEN, NAME = bytes(range(16)), NodeName("cloud-a")
 HEADER = Header(InterfaceId(1), InterfaceId(2), SessionId(7), 9)

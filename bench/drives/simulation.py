@@ -1,33 +1,30 @@
-"""Requests over two paths whose rates change as a scenario's trace says, in simulated time, with the real cores.
+"""Sends requests over two paths whose rates change as a scenario's trace says, in simulated time, with the real cores.
 
-`python -m tests.sim.drives --traces FOLDER` prints what each redundancy mode misses and costs on recorded drives
-(docs/use/redundancy.md). Links are first in, first out, as those of `bench.evaluation.ideal`. Only the rates, delays
-and losses of the trace disturb anybody.
+Links are first in, first out, as those of `bench.evaluation.ideal`. Only the rates, delays and losses of the trace
+disturb anybody.
 """
 
 from __future__ import annotations
 
-import argparse
-import fnmatch
 import math
 import random
-import sys
 from dataclasses import dataclass
 from itertools import count
-from pathlib import Path
 from typing import TYPE_CHECKING
 
-from bench.evaluation.scenario import Scenario, read_scenarios
-from lab.trace_folder import read_folder
+from bench.evaluation.outcome import UNANSWERED_S, Outcome, Request
+from lab.simulated.mesh import IPV6, SERVICE, Mesh, Node, rule
 from plr.controlplane.planning.fifo import FifoLink
-from plr.protos.model.redundancy_mode import RedundancyMode
-from tests.sim.test_mesh import mapped
-from tests.support.mesh import IPV6, Mesh, Node, rule
+from plr.protos.model.ids import InterfaceName, NodeName, Version
+from plr.protos.model.mapping import Assignment, MappingSet, ServiceMapping
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
+    from bench.evaluation.scenario import Scenario
     from plr.protos.model.ids import Address
+    from plr.protos.model.redundancy_mode import RedundancyMode
+    from plr.sidecar.core.base.values import RequestId
     from plr.sidecar.core.rules.budget import Budget
 
 STARTING_S = 1.0
@@ -39,17 +36,12 @@ PATHS = ("a", "b")
 CLOUDS = ("cloud-a", "cloud-b")
 
 
-@dataclass(frozen=True)
-class Driven:
-    """What came of a window."""
+@dataclass(frozen=True, slots=True)
+class Copies:
+    """Bytes of copies, as budgets count them; the warm-up included."""
 
-    requests: int
-    misses: int
-    sent: int
-    """Bytes of IP packets that the robot sent in the window."""
     first: int
     extra: int
-    """Bytes of copies, as budgets count them; the warm-up included."""
 
 
 class DatagramLink(FifoLink):
@@ -58,7 +50,7 @@ class DatagramLink(FifoLink):
     sent = 0
 
     def carry(self, at: float, size: int, rng: random.Random) -> float:
-        """When a datagram of this many bytes, headers included, has arrived; inf: never."""
+        """Return when a datagram of this many bytes, headers included, has arrived; inf: never."""
         self.sent += size
         arrives = self.send(at, size, rng)
         loss = self._losses[self._step(at)]
@@ -69,7 +61,7 @@ class DatagramLink(FifoLink):
 
 
 class DriveMesh(Mesh):
-    """The robot's interface a is behind path a of the trace, b behind b, whichever cloud is at the other end."""
+    """A mesh whose robot has interface a behind path a of the trace and b behind b, whichever cloud is at the end."""
 
     def __init__(self, scenario: Scenario) -> None:
         super().__init__(seed=1)
@@ -94,31 +86,60 @@ class DriveMesh(Mesh):
             self.at(arrives - self.now, lambda: self._arrive(source, destination, data))
 
 
+@dataclass(frozen=True, slots=True)
+class Drive:
+    """One run: what became of its requests, and what its copies weighed."""
+
+    outcome: Outcome
+    copies: Copies
+
+    @property
+    def misses(self) -> int:
+        """Number of requests that missed the deadline."""
+        return round(self.outcome.figures().misses)
+
+    @property
+    def sent(self) -> int:
+        """Bytes of IP packets that the robot sent in the window."""
+        return sum(self.outcome.bytes_sent.values())
+
+
 def drive(
     scenario: Scenario, mode: RedundancyMode, paths: Sequence[str] = PATHS, budget: Budget | None = None
-) -> Driven:
+) -> Drive:
     """Send the scenario's requests over these of its paths."""
     traffic = scenario.traffic
     mesh = DriveMesh(scenario)
     mesh.budgets = (budget,) if budget else ()
-    service = rule(deadline_s=traffic.deadline_ms / 1e3, redundancy=mode, exploration=0.01)
+    service = rule(deadline_s=traffic.deadline_ms / 1e3, redundancy=mode, exploration=0.01, lifetime_s=UNANSWERED_S)
     robot = mesh.robot(*paths, rules=(service,))
     for name in CLOUDS:
         _answer_one_at_a_time(mesh, mesh.cloud(name), traffic.compute_ms / 1e3, traffic.answer_bytes)
     mesh.push_views()
     mesh.run(STARTING_S)
-    mapped(mesh, robot, *zip(paths, CLOUDS, strict=False))
+    _map(mesh, robot, zip(paths, CLOUDS, strict=False))
     numbers = count(1)
     _call(mesh, robot, int(WARM_S * traffic.rate_hz), scenario, numbers)
     mesh.now = mesh.begins
     asked = _call(mesh, robot, scenario.count, scenario, numbers)
-    sent = sum(mesh.links[name, True].sent for name in PATHS)
-    mesh.run(2 * traffic.deadline_ms / 1e3)
-    in_time = {event.request_id for event in robot.responses() if not event.late}
+    sent = {name: mesh.links[name, True].sent for name in paths}
+    mesh.run(UNANSWERED_S)
+    answers = {event.request_id: event for event in robot.responses()}
+    requests = [
+        Request(due_s, due_s, due_s + answers[request_id].elapsed_s if request_id in answers else None)
+        for request_id, due_s in asked.items()
+    ]
     copies = {"first": 0, "extra": 0}
     for (_, _, kind), size in robot.engine.stats.copy_bytes.items():
         copies[kind] += size
-    return Driven(len(asked), len(asked - in_time), sent, copies["first"], copies["extra"])
+    contender = f"plr-{mode.value}" if len(paths) > 1 else f"plr-{mode.value}-{paths[0]}"
+    outcome = Outcome(scenario.name, scenario.case, contender, traffic.deadline_ms, tuple(requests), sent)
+    return Drive(outcome, Copies(**copies))
+
+
+def _map(mesh: Mesh, robot: Node, pairs: zip[tuple[str, str]]) -> None:
+    assignments = tuple(Assignment(InterfaceName(interface), NodeName(server)) for interface, server in pairs)
+    mesh.push_mapping(robot, MappingSet(Version(1), 1, (ServiceMapping(SERVICE, assignments),)))
 
 
 def _answer_one_at_a_time(mesh: Mesh, cloud: Node, compute_s: float, size: int) -> None:
@@ -133,37 +154,11 @@ def _answer_one_at_a_time(mesh: Mesh, cloud: Node, compute_s: float, size: int) 
     cloud.answer = lambda request: request[:16] + bytes(size)
 
 
-def _call(mesh: Mesh, robot: Node, calls: int, scenario: Scenario, numbers: count[int]) -> set[bytes]:
-    asked: set[bytes] = set()
+def _call(mesh: DriveMesh, robot: Node, calls: int, scenario: Scenario, numbers: count[int]) -> dict[RequestId, float]:
+    """Send the requests; return when each was due, from the start of the window."""
+    asked: dict[RequestId, float] = {}
     for _ in range(calls):
-        asked.add(robot.submit(next(numbers).to_bytes(4, "big") + bytes(scenario.traffic.request_bytes)))
+        due_s = mesh.now - mesh.begins
+        asked[robot.submit(next(numbers).to_bytes(4, "big") + bytes(scenario.traffic.request_bytes))] = due_s
         mesh.run(1 / scenario.traffic.rate_hz)
     return asked
-
-
-def main() -> None:
-    """Print the table."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--traces", type=Path, required=True, help="folder of recorded traces")
-    parser.add_argument("--scenario", default="a-drive-*", metavar="GLOB")
-    options = parser.parse_args()
-    modes = [RedundancyMode.SINGLE, RedundancyMode.HEDGE, RedundancyMode.ADAPTIVE, RedundancyMode.REPLICATE]
-    total = dict.fromkeys(("alone", *(mode.value for mode in modes)), (0, 0))
-    for scenario in read_scenarios(read_folder(options.traces)):
-        if not fnmatch.fnmatch(scenario.name, options.scenario):
-            continue
-        alone = min((drive(scenario, RedundancyMode.SINGLE, path) for path in PATHS), key=lambda of: of.misses)
-        runs = {"alone": alone, **{mode.value: drive(scenario, mode) for mode in modes}}
-        for name, run in runs.items():
-            total[name] = (total[name][0] + run.misses, total[name][1] + run.sent)
-        line = ", ".join(f"{name} {run.misses} missed {run.sent / 1e6:.1f} MB" for name, run in runs.items())
-        sys.stdout.write(f"{scenario.name}: {line}\n")
-        sys.stdout.flush()
-    (alone_missed, _), (replicate_missed, _), (_, single_sent) = total["alone"], total["replicate"], total["single"]
-    for name, (missed, sent) in total.items():
-        avoided = (alone_missed - missed) / max(1, alone_missed - replicate_missed)
-        sys.stdout.write(f"{name}: {missed} missed, {avoided:.1%} avoided, {sent / single_sent - 1:+.1%} bytes\n")
-
-
-if __name__ == "__main__":
-    main()

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field, replace
 from itertools import count
 from typing import TYPE_CHECKING
 
+from lab.simulated.sessions import session_of
 from plr.protos.model.ids import InterfaceId, InterfaceName, NodeName, Role, ServiceName, SessionId, Version
 from plr.protos.model.members import ALL_CALLS, Candidate, CandidateKind, Peer, PeerSet, ServiceOffer
 from plr.protos.trust.credential import Aead
@@ -24,7 +25,6 @@ from plr.sidecar.core.path.pmtu import HEADERS_V4
 from plr.sidecar.core.rules.service_rule import ServiceRule
 from plr.sidecar.core.seam.application import ApplicationEvent, CarriedService, ExecuteRequest, ResponseArrived
 from plr.sidecar.core.seam.links import SetReady
-from tests.support.sessions import session_of
 
 if TYPE_CHECKING:
     from collections.abc import Callable

@@ -1,0 +1,67 @@
+"""Defines what the judged windows must show (written before the runs that it judges).
+
+*Clean* windows: the faster of two first-in-first-out paths (`ideal`) misses nothing. *Good* ones: it misses at most
+GOOD of the requests. P99 counts a request without an answer as UNANSWERED_S. *Before* is `plr-replicate` as it was when
+this was written (`before.json`). *Ours* is the mode that is the default.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from bench.drives.contenders import FIFO
+from bench.drives.oracles import Causal
+from bench.evaluation.outcome import together
+from bench.reporting.targets import Target
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from bench.evaluation.outcome import Figures, Outcome
+
+    Runs = Mapping[str, Mapping[str, Outcome]]
+    """Window -> contender -> run."""
+
+GOOD = 0.01
+SINGLE = "plr-single"
+
+TARGETS = (
+    Target("misses_over_causal_shared", "our misses over those of the causal oracle that shares", at_most=1.5),
+    Target("misses_over_replicate_before", "our misses over those of replicate before", at_most=0.5),
+    Target(
+        "clean_mean_over_fifo_ms", "clean windows: our mean less the FIFO pair's, the worst window, ms", at_most=0.0
+    ),
+    Target("clean_bytes_over_single", "clean windows: our bytes over those of one copy", at_most=1.25),
+    Target("good_p99_over_fifo_ms", "good windows: our P99 less the FIFO pair's, the worst window, ms", at_most=5.0),
+)
+
+
+def figures(runs: Runs, ours: str, before: Mapping[str, Figures]) -> dict[str, float]:
+    """Return the figures of these windows; those that a missing contender is needed for are left out."""
+    found: dict[str, float] = {}
+    mine = {name: of[ours].figures().misses for name, of in runs.items() if ours in of}
+    shared = {name: of[Causal.SHARED.value].figures().misses for name, of in runs.items() if Causal.SHARED.value in of}
+    replicated = {name: before[name].misses for name in runs.keys() & before.keys()}
+    for key, anchor in (("misses_over_causal_shared", shared), ("misses_over_replicate_before", replicated)):
+        both = mine.keys() & anchor.keys()
+        if both:
+            found[key] = sum(mine[name] for name in both) / max(sum(anchor[name] for name in both), 1.0)
+    clean = _windows(runs, ours, most=0.0)
+    if clean:
+        found["clean_mean_over_fifo_ms"] = max(of[ours].figures().mean_ms - of[FIFO].figures().mean_ms for of in clean)
+    good = _windows(runs, ours, most=GOOD)
+    if good:
+        found["good_p99_over_fifo_ms"] = max(of[ours].figures().p99_ms - of[FIFO].figures().p99_ms for of in good)
+    weighed = [of for of in clean if SINGLE in of]
+    if weighed:
+        found["clean_bytes_over_single"] = _bytes(weighed, ours) / _bytes(weighed, SINGLE)
+    return found
+
+
+def _windows(runs: Runs, ours: str, most: float) -> list[Mapping[str, Outcome]]:
+    both = [of for of in runs.values() if ours in of and FIFO in of]
+    return [of for of in both if of[FIFO].figures().miss_ratio <= most]
+
+
+def _bytes(runs: Sequence[Mapping[str, Outcome]], contender: str) -> float:
+    return together([of[contender] for of in runs]).figures().bytes_per_request or 0.0

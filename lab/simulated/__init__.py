@@ -1,0 +1,1 @@
+"""Runs real cores in simulated time: no socket, no thread, no clock."""
