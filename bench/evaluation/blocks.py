@@ -163,7 +163,8 @@ def _others(content: Content) -> str:
     )
     return (
         f"{_UNANSWERED} P99 is of all requests.\n\n{table_as_markdown(Table('', columns, tuple(rows)))}"
-        f"\nIn how many windows theirs is the lower figure, and in how many `{SUREST}`'s; in the rest both are alike:"
+        "\nThe next table counts windows. Left of each colon is the number of windows in which the contender has the "
+        f"lower figure, right of it the number in which `{SUREST}` has it. In all other windows the two are equal."
         f"\n\n{table_as_markdown(Table('', ('', *told.values()), counts))}"
     )
 
@@ -276,7 +277,7 @@ _BLOCKS: dict[str, Callable[[Content], str]] = {
     "budgets": _budgets,
     "fallback": _fallback,
 }
-_UNANSWERED = f"Who has no answer after {UNANSWERED_S:g} s counts as {UNANSWERED_S:g} s."
+_UNANSWERED = f"A request without an answer after {UNANSWERED_S:g} s counts as {UNANSWERED_S:g} s."
 
 
 def _label(name: str) -> str:
