@@ -72,6 +72,16 @@ def test_bursts_with_pauses_measure_the_link_and_keep_the_rate(rate: float, dela
     assert world.up.longest_wait_s < 0.012
 
 
+@pytest.mark.parametrize("size", [2_000, 9_000, 25_000, 120_000])
+def test_a_pause_between_requests_is_known_to_be_one(size: int) -> None:
+    """Also when the last symbols of a request use up what pacing allows."""
+    world = World(2.4 * MBIT, 0.050)
+    for _ in range(20):
+        world.request(size, 0.01, hz=100)
+        world.mesh.run(2.0)
+        assert world.control.rate.is_dry
+
+
 def test_a_rate_that_drops_is_believed_and_so_is_one_that_rises() -> None:
     world = World(20 * MBIT, 0.025, deadline_s=0.5)
     world.request(60_000, 3.0)

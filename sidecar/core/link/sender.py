@@ -160,10 +160,7 @@ class DatagramBuilder:
         expired_before = queue.expired
         complete = True
         budget = control.budget(now, recovery.in_flight)
-        while budget > 0:
-            if not len(queue):
-                control.ran_dry()
-                break
+        while budget > 0 and len(queue):
             if burst.full:
                 complete = False
                 break
@@ -186,6 +183,8 @@ class DatagramBuilder:
             sent = self._add_run(path, remote, run, burst, now)
             control.on_sent(now, sent, recovery.in_flight)
             budget -= sent
+        if not len(queue):
+            control.ran_dry()  # also when the last run used up the budget: nothing looks at an empty queue again
         if queue.expired != expired_before:
             self._stats.dropped["expired"] += queue.expired - expired_before
         return complete
