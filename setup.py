@@ -5,6 +5,7 @@ from __future__ import annotations
 import atexit
 import runpy
 import shutil
+import sys
 import tempfile
 from pathlib import Path
 
@@ -14,6 +15,25 @@ from setuptools.command.build_py import build_py
 from setuptools.command.sdist import sdist
 
 ROOT = Path(__file__).resolve().parent
+
+
+def link_packages(folder: Path) -> None:
+    """Let `plr/NAME` lead to the top-level folder of that name, as in git.
+
+    A zip archive, or a checkout with `core.symlinks=false`, has a text file in place of each link. In a source
+    distribution the packages themselves lie in `plr`, and nothing at the top.
+    """
+    for name in ("controlplane", "protos", "sidecar"):
+        package, source = folder / "plr" / name, folder / name
+        if package.is_symlink() or not source.is_dir():
+            continue
+        if package.is_dir():
+            sys.exit(f"{package} is a copy of {source}, which it must be a link to; do: rm -r plr; git checkout -- plr")
+        package.unlink(missing_ok=True)
+        package.symlink_to(Path("..", name), target_is_directory=True)
+
+
+link_packages(ROOT)
 COMMIT = runpy.run_path(str(ROOT / "plr" / "protos" / "program" / "commit.py"))
 
 

@@ -20,6 +20,7 @@ from plr.protos.program.config_fields import (
     RemoteAddress,
     TlsDir,
     check_security,
+    converted,
     refuse_duplicates,
 )
 from plr.protos.program.config_file import parse_yaml, read_text, validate
@@ -57,7 +58,7 @@ class ControlPlaneConfig(Section):
     listen: ListenAddress = "[::]:50051"
     """Where gRPC is served, for sidecars and `plr`. `[::]` means all addresses, IPv4 included; port 0 takes a free
     one."""
-    tls_dir: TlsDir | None = None
+    tls_dir: Annotated[TlsDir, converted] | None = None
     """Required without `insecure`. Folder with `cert.pem`, `key.pem`, `ca.pem` and perhaps `crl.pem`, as
     `plr ca issue NAME --role controlplane` writes it. It is checked four times a second: new files, above all a
     revocation list, take effect without a restart."""
@@ -65,16 +66,16 @@ class ControlPlaneConfig(Section):
     """`true` in place of `tls_dir`: no TLS, and everybody is who they say. This is for trials on one machine: a
     `listen` address that others reach is refused unless `--insecure-i-know` is on the command line."""
     stun_listen: Annotated[
-        tuple[ListenAddress, ...], Field(max_length=16), OneOrList(), AfterValidator(refuse_duplicates)
+        tuple[ListenAddress, ...], Field(max_length=16, strict=False), OneOrList(), AfterValidator(refuse_duplicates)
     ] = ("[::]:3478",)
     """Where STUN is answered. An empty list turns it off."""
     stun_servers: Annotated[
-        tuple[RemoteAddress, ...], Field(max_length=16), OneOrList(), AfterValidator(refuse_duplicates)
+        tuple[RemoteAddress, ...], Field(max_length=16, strict=False), OneOrList(), AfterValidator(refuse_duplicates)
     ] = ()
     """STUN servers for the sidecars to ask, as seen from them: this host's public address, others, or both."""
     metrics_listen: ListenAddress | None = "127.0.0.1:9465"
     """Where Prometheus reads the metrics; `null` for none."""
-    state_dir: AbsolutePath | None = None
+    state_dir: Annotated[AbsolutePath, converted] | None = None
     """Folder for the log of events, one for each control plane; it is made if missing. The folder, the folders above it
     and links on the way must belong to root or the program's user. Without this key events are in memory only, and a
     restart forgets who is gone. The shipped configuration sets `/var/lib/plr-controlplane`."""
@@ -95,7 +96,7 @@ class ControlPlaneConfig(Section):
     default_capacity_interfaces: Annotated[int, Field(ge=0, le=256)] = 1
     """How many interfaces of one robot may share a server for one service; `0` for no limit. 1 is the paper's value:
     every interface has its own server. The limit is exceeded by the least amount where servers are too few."""
-    objective: Objective = Objective.JOINT
+    objective: Annotated[Objective, converted] = Objective.JOINT
     """What the mapping minimises.
 
     - `joint`: the probability that all copies of a request miss the deadline, with paths that were seen to fail
@@ -106,7 +107,7 @@ class ControlPlaneConfig(Section):
     solver_time_limit_ms: Annotated[int, Field(ge=10, le=60_000)] = 2000
     """Longest time for one solve; then the incumbent is taken. An urgent solve, after paths died or came back, is
     limited to 0.1 s, or to 0.25 ms for each service of a robot if that is longer. The next routine solve goes on."""
-    paths: Annotated[tuple[PathRuleConfig, ...], Field(max_length=MAX_PATH_RULES)] = ()
+    paths: Annotated[tuple[PathRuleConfig, ...], Field(max_length=MAX_PATH_RULES, strict=False)] = ()
     """Rules on which pairs of an interface and a cloud mappings may use. The first that matches decides; what none
     matches is allowed. They are for planning, not for protection, which is the task of `policy`."""
     policy: Annotated[PolicyConfig | None, BeforeValidator(_empty_if_null)] = None

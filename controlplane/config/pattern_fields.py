@@ -52,7 +52,7 @@ _PATTERN = text_of("pattern")
 _NodePattern = Annotated[str, AfterValidator(lambda pattern: _check(pattern, NameKind.NODE)), _PATTERN]
 _ServicePattern = Annotated[str, AfterValidator(lambda pattern: _check(pattern, NameKind.SERVICE)), _PATTERN]
 _InterfacePattern = Annotated[str, AfterValidator(lambda pattern: _check(pattern, NameKind.INTERFACE)), _PATTERN]
-_List = (Field(min_length=1, max_length=MAX_PATTERNS), OneOrList(), AfterValidator(refuse_duplicates))
+_List = (Field(min_length=1, max_length=MAX_PATTERNS, strict=False), OneOrList(), AfterValidator(refuse_duplicates))
 NodePatterns = Annotated[tuple[_NodePattern, ...], *_List]
 ServicePatterns = Annotated[tuple[_ServicePattern, ...], *_List]
 InterfacePatterns = Annotated[tuple[_InterfacePattern, ...], *_List]

@@ -34,9 +34,9 @@ class OfferRuleConfig(Section):
 class PolicyConfig(Section):
     """What is allowed; everything else is denied."""
 
-    calls: Annotated[tuple[CallRuleConfig, ...], Field(max_length=MAX_RULES)] = ()
+    calls: Annotated[tuple[CallRuleConfig, ...], Field(max_length=MAX_RULES, strict=False)] = ()
     """Rules: which robots may call which services on which clouds."""
-    offers: Annotated[tuple[OfferRuleConfig, ...], Field(max_length=MAX_RULES)] = ()
+    offers: Annotated[tuple[OfferRuleConfig, ...], Field(max_length=MAX_RULES, strict=False)] = ()
     """Rules: which clouds may offer which services."""
 
     def policy(self) -> Policy:

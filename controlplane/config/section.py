@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from pydantic import BaseModel, ConfigDict
+from pydantic import BaseModel
+
+from plr.protos.program.config_fields import STRICT
 
 
 class Section(BaseModel):
-    """A section: no unknown keys, then frozen."""
+    """A section: checked strictly, then frozen."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid", use_attribute_docstrings=True)
+    model_config = STRICT

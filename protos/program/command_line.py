@@ -32,7 +32,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         with extras.required("plr", "controlplane" if name == OPERATOR else "sidecar"):
             run = commands[name].load()
     except KeyError:
-        sys.stderr.write("plr: the installation is incomplete; do: pip install --force-reinstall fogros2-plr\n")
+        sys.stderr.write("plr: the installation is incomplete: install the same wheel or checkout again\n")
         return EXIT_FAILED
     code: int = run(given if name == OPERATOR else given[1:])
     return code

@@ -6,9 +6,15 @@ import os
 from pathlib import Path
 from typing import Annotated
 
-from pydantic import AfterValidator, BeforeValidator, WithJsonSchema
+from pydantic import AfterValidator, BeforeValidator, ConfigDict, Field, WithJsonSchema
 
 from plr.protos.base.host_port import canonical_ip, check_remote, split_host_port
+
+STRICT = ConfigDict(extra="forbid", frozen=True, strict=True, allow_inf_nan=False, use_attribute_docstrings=True)
+"""For every section: values have the type that the key asks for, and no key is unknown."""
+
+# A YAML list becomes a tuple, a word an enum or a path; strict mode would refuse these. A list's items stay strict.
+converted = Field(strict=False)
 
 
 def refuse_duplicates(values: tuple[str, ...]) -> tuple[str, ...]:

@@ -6,14 +6,14 @@ import re
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, PlainValidator, WithJsonSchema
+from pydantic import AfterValidator, BaseModel, Field, PlainValidator, WithJsonSchema
 
 from plr.protos.base.errors import DecodeError
 from plr.protos.base.host_port import check_remote
 from plr.protos.convert.fields import MAX_MAPPED_COPIES
 from plr.protos.model.members import AT_MOST_EVERY_INTERFACE, EVERY_INTERFACE, Copies
 from plr.protos.model.names import domain_label, node_name
-from plr.protos.program.config_fields import REMOTE_ADDRESS, encoded_path, refuse_duplicates, text_of
+from plr.protos.program.config_fields import REMOTE_ADDRESS, STRICT, encoded_path, refuse_duplicates, text_of
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -119,16 +119,10 @@ def _check_copies(value: object) -> Copies:
     raise ValueError(f"expected each, at_most or a number from 1 to {MAX_MAPPED_COPIES}, got {value!r}")
 
 
-# A YAML list becomes a tuple, a word an enum; strict mode would refuse both. The items of a list stay strict.
-converted = Field(strict=False)
-
-
 class Section(BaseModel):
     """A section: checked strictly, then frozen."""
 
-    model_config = ConfigDict(
-        extra="forbid", frozen=True, strict=True, allow_inf_nan=False, use_attribute_docstrings=True
-    )
+    model_config = STRICT
 
     def misplaced(self, role: Role) -> Iterator[tuple[str, str]]:
         """Yield each key of the other role that has a value, and why it has no place here."""

@@ -11,6 +11,7 @@ from plr.protos.convert.fields import MAX_COST_PER_REQUEST
 from plr.protos.model.ids import Role, ServiceName
 from plr.protos.model.members import AT_MOST_EVERY_INTERFACE, DEFAULT_COST_PER_REQUEST, EVERY_INTERFACE
 from plr.protos.model.redundancy_mode import DEFAULT_ADAPTIVE_TARGET, DEFAULT_HEDGE_QUANTILE, RedundancyMode
+from plr.protos.program.config_fields import converted
 from plr.sidecar.config.fields import (
     CopiesWanted,
     DomainLabel,
@@ -21,7 +22,6 @@ from plr.sidecar.config.fields import (
     Section,
     ServicePattern,
     ServiceType,
-    converted,
     is_glob,
 )
 from plr.sidecar.core.base.values import Priority

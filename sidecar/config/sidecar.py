@@ -22,6 +22,7 @@ from plr.protos.program.config_fields import (
     TlsDir,
     check_absolute,
     check_security,
+    converted,
     refuse_duplicates,
     text_of,
 )
@@ -36,7 +37,6 @@ from plr.sidecar.config.fields import (
     OnlyOn,
     Section,
     SidecarName,
-    converted,
     is_glob,
 )
 from plr.sidecar.config.service import NetworkConfig, ServiceConfig

@@ -153,6 +153,7 @@ def checkout(tmp_path: Path) -> Path:
     for name in ("__init__.py", "stays.py", "goes.py"):
         (folder / "sidecar" / name).touch()
     (folder / "plr").mkdir()
+    shutil.copy(ROOT / "plr/__init__.py", folder / "plr")
     for name in ("protos", "sidecar"):
         (folder / "plr" / name).symlink_to(f"../{name}")
     return folder
@@ -189,6 +190,36 @@ def test_a_wheel_owns_one_name_alone(checkout: Path) -> None:
     """PyPI has packages called `sidecar` and `protos`: in one environment with ours, neither replaces the other."""
     tops = {name.partition("/")[0] for name in content(build(checkout))}
     assert {top for top in tops if not top.endswith(".dist-info")} == {"plr"}
+
+
+def test_text_files_in_place_of_the_links_become_links(checkout: Path) -> None:
+    """A zip archive has them, and a checkout with core.symlinks=false."""
+    for name in ("protos", "sidecar"):
+        (checkout / "plr" / name).unlink()
+        (checkout / "plr" / name).write_text(f"../{name}")
+    assert "plr/sidecar/stays.py" in content(build(checkout))
+    assert (checkout / "plr/sidecar").readlink() == Path("../sidecar")
+
+
+def test_a_copy_in_place_of_a_link_is_refused(checkout: Path) -> None:
+    """An edit of the source would not be in the wheel."""
+    (checkout / "plr/sidecar").unlink()
+    shutil.copytree(checkout / "sidecar", checkout / "plr/sidecar")
+    done = subprocess.run(
+        [sys.executable, "setup.py", "--version"], cwd=checkout, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 1
+    assert "plr/sidecar is a copy of" in done.stderr
+    assert "git checkout -- plr" in done.stderr
+
+
+def test_a_package_of_the_same_name_behind_ours_is_not_taken(tmp_path: Path) -> None:
+    other = tmp_path / "plr"
+    other.mkdir()
+    (other / "__init__.py").touch()
+    code = f"import sys; sys.path.append({str(tmp_path)!r}); import plr.protos.program.commit as it; print(it.__file__)"
+    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
 
 
 @pytest.mark.audit("ops-10")
