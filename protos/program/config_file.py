@@ -6,6 +6,7 @@ Both planes read their configuration with it. Its cost is bounded: aliases do no
 from __future__ import annotations
 
 import difflib
+import re
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import yaml
@@ -32,6 +33,9 @@ _MAX_WHOLE = (1 << 63) - 1
 _MAX_NUMBER_CHARACTERS = 64
 
 _SHOWN_INPUT_CHARACTERS = 60
+
+_UNQUOTED = re.compile(r"(^|[:,\[{-])\s*(\*|\[[0-9A-Fa-f:]*\]:)")
+"""An address such as [::]:50051, or a pattern such as *, which YAML takes for a list or an alias."""
 
 _EXPECTED = {
     "tuple_type": "a list",
@@ -74,6 +78,8 @@ class _StrictLoader(yaml.SafeLoader):
             if key_node.tag == "tag:yaml.org,2002:merge":
                 continue
             key = self.construct_object(key_node, deep=True)
+            if isinstance(key, dict | list | set):
+                raise _refused("a key has to be text", key_node)
             if key in seen:
                 raise yaml.constructor.ConstructorError(
                     None, None, f"key {key!r} is written twice", key_node.start_mark
@@ -147,7 +153,9 @@ def parse_yaml(text: str, source: str) -> dict[str, Any]:
     except yaml.MarkedYAMLError as error:
         mark = error.problem_mark
         where = f"line {mark.line + 1}" if mark else ""
-        raise ConfigError(source, where, f"expected YAML: {error.problem or error.context}") from error
+        lines = text.splitlines()[max(0, mark.line - 1) : mark.line + 1] if mark else []
+        hint = "; put a value that begins with [ or * in quotes" if any(map(_UNQUOTED.search, lines)) else ""
+        raise ConfigError(source, where, f"expected YAML: {error.problem or error.context}{hint}") from error
     except (yaml.YAMLError, ValueError, TypeError, LookupError, AttributeError, RecursionError) as error:
         # The constructors of the YAML package leak these errors for malformed scalars (!!int x, 2026-02-31).
         raise ConfigError(source, "", f"expected YAML: {_one_line(str(error))}") from error
@@ -205,6 +213,8 @@ def _describe(model: type[BaseModel], problem: ErrorDetails) -> str:
         close = difflib.get_close_matches(str(problem["loc"][-1]), known, n=1, cutoff=0.5)
         hint = f"did you mean {close[0]}?" if close else f"expected one of {', '.join(known)}"
         return f"unknown key; {hint}"
+    if kind == "invalid_key":
+        return f"expected a key that is text, got {_shown(problem['loc'][-1])}; quote it"
     if kind == "too_short":
         return f"expected at least {problem['ctx']['min_length']} entry"
     if kind in _EXPECTED:

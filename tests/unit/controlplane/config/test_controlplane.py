@@ -118,6 +118,10 @@ def test_a_policy_is_read_with_lists_or_single_patterns() -> None:
         ("stun_servers: '0.0.0.0:3478'", "stun_servers[0]: expected an address that can be reached, got"),
         ("stun_servers: 'a:0'", "stun_servers[0]: expected host:port with a port from 1 to 65535, got 'a:0'"),
         ("log_level: loud", "log_level: expected 'debug', 'info', 'warning' or 'error', got 'loud'"),
+        ("listen: [::]:50051", "line 1: expected YAML: expected the node content, but found ':'; put a value that"),
+        ("paths:\n  - robots: *", "line 2: expected YAML: expected alphabetic or numeric character, but found"),
+        ("paths:\n  - {allow: true, 1: 2}", "paths[0][1]: expected a key that is text, got 1; quote it"),
+        ("{a: 1}: 1", "line 1: expected YAML: a key has to be text"),
         ("lease_ms: 5000\nlease_ms: 6000", "line 2: expected YAML: key 'lease_ms' is written twice"),
         ("1: 2", "1: expected a key that is text; quote it"),
         ("- lease_ms", "expected keys and values, got ['lease_ms']"),
@@ -131,6 +135,15 @@ def test_a_mistake_is_one_line_that_names_file_key_and_expectation(text: str, li
         parse_config(text, "control.yaml")
     assert str(caught.value).startswith(f"control.yaml: {line}")
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    "text",
+    ["listen: [::]:1", "stun_listen:\n  - [::1]:1", "paths:\n  - robots: *\n", "paths: [{robots: *, allow: no}]"],
+)
+def test_what_needs_quotes_is_said(text: str) -> None:
+    with pytest.raises(ConfigError, match="put a value that begins with . or . in quotes"):
+        parse_config(text, "control.yaml")
 
 
 def test_several_mistakes_are_counted() -> None:
