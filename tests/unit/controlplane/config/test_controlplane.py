@@ -142,7 +142,7 @@ def test_a_mistake_is_one_line_that_names_file_key_and_expectation(text: str, li
     ["listen: [::]:1", "stun_listen:\n  - [::1]:1", "paths:\n  - robots: *\n", "paths: [{robots: *, allow: no}]"],
 )
 def test_what_needs_quotes_is_said(text: str) -> None:
-    with pytest.raises(ConfigError, match="put a value that begins with . or . in quotes"):
+    with pytest.raises(ConfigError, match=r"put a value that begins with \[ or \* in quotes"):
         parse_config(text, "control.yaml")
 
 
