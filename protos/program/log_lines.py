@@ -35,14 +35,14 @@ def is_journal(stream: TextIO) -> bool:
 
 
 class LineFormatter(logging.Formatter):
-    """2026-01-31T12:00:00.250Z WARNING control_client: text; a traceback follows on indented lines.
+    """2026-01-31T12:00:00.250Z WARNING control.client: text; a traceback follows on indented lines.
 
     Unprintable characters are escaped, as `repr` does: an escape sequence would move the cursor of a terminal that
     shows the log, and a line feed would begin a line that looks like one of ours.
     """
 
     def __init__(self, own_package: str = "") -> None:
-        """Leave out `own_package` before the component's name."""
+        """Leave out `own_package` before the component's name, and `plr` before that of a shared one."""
         super().__init__()
         self._prefix = f"{own_package}." if own_package else ""
 
@@ -56,7 +56,7 @@ class LineFormatter(logging.Formatter):
         return f"{self.formatTime(record)} {record.levelname} {self._told(record)}"
 
     def _told(self, record: logging.LogRecord) -> str:
-        component = record.name.removeprefix(self._prefix)
+        component = record.name.removeprefix(self._prefix).removeprefix("plr.")
         line = f"{component}: {escaped(record.getMessage())}"
         if record.exc_info:
             trace = self.formatException(record.exc_info).split("\n")
@@ -65,7 +65,7 @@ class LineFormatter(logging.Formatter):
 
 
 class JournalFormatter(LineFormatter):
-    """<4>control_client: text; each line has its priority, as the journal makes each an entry."""
+    """<4>control.client: text; each line has its priority, as the journal makes each an entry."""
 
     def format(self, record: logging.LogRecord) -> str:
         """Return the line."""
