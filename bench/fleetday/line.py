@@ -137,6 +137,7 @@ class Line:
         self._write()
 
     def _end(self, *, refused: bool) -> None:
+        self._member.fell_ill()  # it believes that the stream is open until it hears of the end
         self._timeline.after(self._delay_s, partial(self._member.line_ended, self, refused=refused))
         self.dead = True
 

@@ -126,7 +126,7 @@ class Member:
         self.session.set_candidates(self.candidates)
         self.session.set_services(self.services)
         self._changed()
-        self._fell_ill()
+        self.fell_ill()
         self._schedule()
 
     def registration(self) -> Registration:
@@ -154,7 +154,7 @@ class Member:
             line.dead |= silently
             line.hang_up()
         self._changed()
-        self._fell_ill()
+        self.fell_ill()
 
     def drain(self) -> None:
         """Say goodbye; `crash` follows once requests in flight are done."""
@@ -177,14 +177,15 @@ class Member:
         line, self.line = self.line, None
         if line is not None and self.session is not None:
             line.hang_up()
-            self._fell_ill()
+            self.fell_ill()
             self.session.closed(self._timeline.now, moved=True)
             self._schedule()
 
     def _changed(self) -> None:
         self.changed_at = self._timeline.now
 
-    def _fell_ill(self) -> None:
+    def fell_ill(self) -> None:
+        """Note that something keeps it from holding what it should."""
         self.ill_at = self._timeline.now
 
     # ── its state ──
@@ -266,7 +267,7 @@ class Member:
     def _open(self, session: ControlSession) -> None:
         session.opened(self._timeline.now)
         self.line = Line(self._timeline, self._plane, self, self._rng)
-        self._fell_ill()
+        self.fell_ill()
         if self.network_down:
             self.line.dead = True
         elif not self._plane.up:
@@ -296,7 +297,7 @@ class Member:
         if line is not self.line or self.session is None:
             return
         self.line = None
-        self._fell_ill()
+        self.fell_ill()
         self.session.closed(self._timeline.now, refused=refused)
         self._wake_at = float("inf")
         self._schedule()
@@ -306,7 +307,7 @@ class Member:
         line = self.line
         if line is None:
             return
-        self._fell_ill()
+        self.fell_ill()
         if half_open:
             line.dead = True
             notices_s = self._rng.uniform(*NOTICES_S)
@@ -327,7 +328,7 @@ class Member:
         event = self.session.receive(message, self._timeline.now)
         if isinstance(event, Welcome):
             if before is not ControlState.ONLINE:
-                self._fell_ill()
+                self.fell_ill()
                 self.paths_changed()
             # It may wake sooner than planned for the longer patience of a registration.
         elif isinstance(event, Apply):

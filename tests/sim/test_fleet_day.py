@@ -12,6 +12,7 @@ import pytest
 
 from bench.fleetday.day import Day, Scale
 from bench.fleetday.held import HeldPeers
+from bench.fleetday.line import Line
 from bench.fleetday.sizes import Sizes, grown, measure
 from plr.controlplane.core.formulation.problem_builder import Drawing
 from plr.controlplane.core.publish.snapshots import Track
@@ -102,6 +103,26 @@ def test_what_is_taken_for_synced_without_being_so_is_seen(tmp_path: Path, monke
     day.timeline.after(300.0, day.refuse_all)
     day.run()
     assert any("believed to hold" in complaint for complaint in day.checker.complaints)
+
+
+def test_a_member_that_has_not_heard_yet_of_the_end_of_its_stream_is_not_judged(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The fleet of 1,000 met a look within these milliseconds once in a day."""
+    day = Day(7, SHORT, tmp_path)
+    end = Line._end
+    ends = 0
+
+    def end_and_look(self: Line, *, refused: bool) -> None:
+        nonlocal ends
+        end(self, refused=refused)
+        ends += 1
+        day.checker.look(day.timeline.now)
+
+    monkeypatch.setattr(Line, "_end", end_and_look)
+    day.run()
+    assert ends > 10
+    assert [one for one in day.checker.complaints if "believes that it is registered" in one] == []
 
 
 def test_a_table_that_is_never_pruned_is_seen(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
