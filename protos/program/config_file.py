@@ -33,6 +33,9 @@ _MAX_WHOLE = (1 << 63) - 1
 _MAX_NUMBER_CHARACTERS = 64
 
 _SHOWN_INPUT_CHARACTERS = 60
+_MAX_PROBLEM_CHARACTERS = 400
+"""A line that quotes what was written stays readable whatever that is."""
+_EXPONENT = re.compile(r"[+-]?\d+(\.\d*)?[eE]\d+")
 
 _UNQUOTED = re.compile(r"(^|[:,\[{-])\s*(\*|\[[0-9A-Fa-f:]*\]:)")
 """An address such as [::]:50051, or a pattern such as *, which YAML takes for a list or an alias."""
@@ -218,11 +221,17 @@ def _describe(model: type[BaseModel], problem: ErrorDetails) -> str:
     if kind == "too_short":
         return f"expected at least {problem['ctx']['min_length']} entry"
     if kind in _EXPECTED:
-        return f"expected {_EXPECTED[kind]}, got {_shown(problem['input'])}"
+        return f"expected {_EXPECTED[kind]}, got {_shown(problem['input'])}{_number_hint(kind, problem['input'])}"
     message = problem["msg"].removeprefix("Value error, ")
     if message.startswith("Input should be "):
         message = f"expected {message.removeprefix('Input should be ')}, got {_shown(problem['input'])}"
-    return _one_line(message)
+    return _cut(_one_line(message))
+
+
+def _number_hint(kind: str, value: object) -> str:
+    if kind in ("int_type", "float_type") and isinstance(value, str) and _EXPONENT.fullmatch(value):
+        return "; YAML takes an exponent without a point and a sign for text: write it as 1000 or 1.0e+3"
+    return ""
 
 
 def _keys_at(model: type[BaseModel], location: tuple[str | int, ...]) -> list[str]:
@@ -247,6 +256,10 @@ def _keys_at(model: type[BaseModel], location: tuple[str | int, ...]) -> list[st
 def _shown(value: object) -> str:
     text = "nothing" if value is None else repr(value)
     return text if len(text) <= _SHOWN_INPUT_CHARACTERS else text[:_SHOWN_INPUT_CHARACTERS] + "…"
+
+
+def _cut(text: str) -> str:
+    return text if len(text) <= _MAX_PROBLEM_CHARACTERS else text[:_MAX_PROBLEM_CHARACTERS] + "…"
 
 
 def _one_line(text: str) -> str:

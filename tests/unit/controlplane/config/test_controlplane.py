@@ -146,6 +146,14 @@ def test_what_needs_quotes_is_said(text: str) -> None:
         parse_config(text, "control.yaml")
 
 
+def test_a_long_value_is_cut() -> None:
+    with pytest.raises(ConfigError) as caught:
+        read(f"paths: [{{robots: '{'x' * 100_000}', allow: true}}, {{robots: '{'?' * 200}', allow: true}}]")
+    assert len(str(caught.value)) < 600
+    with pytest.raises(ConfigError, match=r"1000 or 1\.0e\+3"):
+        read("lease_ms: 5e3")
+
+
 def test_several_mistakes_are_counted() -> None:
     with pytest.raises(ConfigError, match=r"\(and 1 more\)$"):
         read("lease_ms: x\nlog_level: y")
