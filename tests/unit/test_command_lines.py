@@ -158,16 +158,24 @@ BEGINS = """
 """
 
 
+def from_a_terminal(script: str) -> subprocess.CompletedProcess[bytes]:
+    """Run a script that Ctrl-C reaches, also where the tests themselves run in the background and ignore it."""
+    begin = (
+        "import os, signal, sys; signal.signal(signal.SIGINT, signal.SIG_DFL); os.execv(sys.executable, sys.argv[1:])"
+    )
+    command = [sys.executable, "-c", begin, sys.executable, "-c", script]
+    return subprocess.run(command, capture_output=True, check=False)
+
+
 @pytest.mark.parametrize(("before", "code"), [("", -2), ("signal.signal(signal.SIGINT, signal.SIG_IGN)", 7)])
 def test_ctrl_c_among_the_imports_ends_without_a_word(before: str, code: int) -> None:
     """One that was started in the background, which ignores it, goes on doing so."""
-    script = textwrap.dedent(BEGINS).format(before=before)
-    done = subprocess.run([sys.executable, "-c", script], capture_output=True, check=False)
+    done = from_a_terminal(textwrap.dedent(BEGINS).format(before=before))
     assert (done.returncode, done.stderr) == (code, b"")
 
 
 def test_ctrl_c_is_answered_once_the_program_runs() -> None:
     script = textwrap.dedent(BEGINS).format(before="").replace("os.kill", "pass; os.kill", 1)
     script = script.replace("pass; os.kill(os.getpid(), signal.SIGINT)", "pass")
-    done = subprocess.run([sys.executable, "-c", script], capture_output=True, check=False)
+    done = from_a_terminal(script)
     assert (done.returncode, done.stderr) == (130, b"")
