@@ -38,6 +38,8 @@ OURS = "plr-adaptive"
 """The mode that is judged."""
 DEFAULT = (*COMPUTED, "plr-single", "plr-replicate", OURS)
 TRAFFIC = Traffic(request_bytes=120_000, answer_bytes=1_000, rate_hz=5, deadline_ms=1_000, compute_ms=20)
+FILE_COLUMNS = 200
+"""Width of the tables where no terminal says one."""
 REPLICATE = "plr-replicate"
 BEFORE_FILE = Path(__file__).with_name("before.json")
 """Figures of `plr-replicate` before this bench judged anything, by window: written once, by --write-before."""
@@ -66,6 +68,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> int:
     """Run, show tables and return the exit code: 1 if a target is missed, 2 if there is nothing to run."""
     console = Console(highlight=False, soft_wrap=True)
+    if not console.is_terminal:
+        console.width = FILE_COLUMNS
     traffic = _traffic(options)
     try:
         found = windows(read_folder(options.traces), traffic)
