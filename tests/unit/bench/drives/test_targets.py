@@ -27,6 +27,17 @@ def test_misses_are_compared_over_the_windows_that_both_ran() -> None:
     assert found == {"misses_over_causal_shared": 0.5, "misses_over_replicate_before": 0.5}
 
 
+def test_half_of_replicates_misses_is_asked_for_where_an_oracle_has_it() -> None:
+    def window(oracle_misses: int) -> dict[str, Outcome]:
+        oracle = outcome("causal-repair", [2.0] * oracle_misses)
+        return {"ours": outcome("ours", [2.0]), "causal-repair": oracle}
+
+    before = dict.fromkeys(("hard", "easy"), outcome("before", [None] * 4).figures())
+    found = figures({"hard": window(3), "easy": window(2)}, "ours", before)
+    assert found["misses_over_replicate_before"] == 2 / 8
+    assert found["misses_over_replicate_where_attainable"] == 1 / 4
+
+
 def test_the_worst_clean_window_counts() -> None:
     fast, slow = [0.1] * 4, [0.2] * 4
     runs = {
