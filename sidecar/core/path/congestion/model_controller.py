@@ -351,7 +351,8 @@ class ModelController:
                 self._drained_at = now
         elif sample.sent_at >= self._drained_at:
             if self._believed_before and self._probe_min_rtt > 2 * rtt.minimum:
-                self.rate.restart(self._believed_before)  # the queue is others': the path is not slower than thought
+                # The queue is others': the path is not slower than thought. But they may all be slower than before.
+                self.rate.restart(min(self._believed_before, STARTUP_GAIN * self.rate.best))
             self._believed_before = 0.0
             rtt.restart_minimum(self._probe_min_rtt, now)
             self._probed_rtt_at = now
