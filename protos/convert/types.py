@@ -59,6 +59,7 @@ _REDUNDANCY_NUMBERS = {
     RedundancyMode.BACKUP: types_pb2.REDUNDANCY_MODE_BACKUP,
     RedundancyMode.HEDGE: types_pb2.REDUNDANCY_MODE_HEDGE,
     RedundancyMode.ADAPTIVE: types_pb2.REDUNDANCY_MODE_ADAPTIVE,
+    RedundancyMode.SHARE: types_pb2.REDUNDANCY_MODE_SHARE,
 }
 _REDUNDANCY_MODES = {number: mode for mode, number in _REDUNDANCY_NUMBERS.items()}
 _CANDIDATE_KINDS = {

@@ -21,6 +21,9 @@ class RedundancyMode(enum.Enum):
     """The same, and the next pair when the answer takes longer than it mostly does (a hedged request)."""
     ADAPTIVE = "adaptive"
     """Over the best mapped pair; others as late as keeps the target miss probability (`adaptive.py`)."""
+    SHARE = "share"
+    """Over all mapped interfaces together, to one server: each carries the part that it can, and spare capacity repeats
+    what others carry (`message/sharing.py`)."""
     REPLICATE = "replicate"
     """Over every mapped pair at once (paper, section IV)."""
 
@@ -28,6 +31,11 @@ class RedundancyMode(enum.Enum):
     def sends_late(self) -> bool:
         """Whether another copy is sent because the first is, or may be, slow."""
         return self in (RedundancyMode.HEDGE, RedundancyMode.ADAPTIVE)
+
+    @property
+    def uses_every_path(self) -> bool:
+        """Whether every mapped interface carries something of a request from the start."""
+        return self in (RedundancyMode.SHARE, RedundancyMode.REPLICATE)
 
     @property
     def helps(self) -> bool:

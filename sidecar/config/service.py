@@ -164,6 +164,8 @@ class ServiceConfig(Section):
     - `hedge`: also the next one when the answer takes long; idempotent services only.
     - `adaptive`: others as well, as late as `target_miss` allows given the progress of the first copy; idempotent
       services only.
+    - `share`: all mapped interfaces carry one copy together, to one server, each as much as it can; spare capacity
+      repeats what the others carry.
     - `replicate`: all at once; `copies` says how many are mapped."""
     hedge_quantile: Annotated[float, Field(ge=MIN_HEDGE_QUANTILE, le=MAX_HEDGE_QUANTILE), _ROBOT] = (
         DEFAULT_HEDGE_QUANTILE

@@ -62,10 +62,19 @@ def message(
     deadline: float = 10.0,
     expires: float = 20.0,
     siblings: list[MessageSymbols] | None = None,
+    repeats: float | None = None,
 ) -> MessageSymbols:
     data = random.Random(number).randbytes(size)
     content = Encoded(b"", data)
-    return MessageSymbols(number, content, priority=priority, deadline=deadline, expires=expires, siblings=siblings)
+    return MessageSymbols(
+        number,
+        content,
+        priority=priority,
+        deadline=deadline,
+        expires=expires,
+        siblings=siblings,
+        repeats=repeats,
+    )
 
 
 def request_id(number: int) -> RequestId:

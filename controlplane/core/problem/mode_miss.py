@@ -1,7 +1,8 @@
 """Estimates how likely a request misses its deadline in the way its service sends copies (docs/use/redundancy.md).
 
-The mapping is chosen as if every pair in it carried a copy at once. That is what `replicate` does; the other modes miss
-more. This module says how much, for what the operator is told. With first pair f and second pair s:
+The mapping is chosen as if every pair in it carried a copy at once. That is what `replicate` does. `share` counts as
+`replicate`: its paths carry parts of one copy, and in spare time each repeats what the others carry. The other modes
+miss more. This module says how much, for what the operator is told. With first pair f and second pair s:
 
     single     epsilon_f
     others     epsilon_f q, where q is the probability that what follows a first copy that misses comes too late as well
@@ -82,7 +83,7 @@ NO_SENDING = Sending({})
 
 def is_timed(use: ServiceUse) -> bool:
     """Return whether the service's prediction takes more than the epsilons."""
-    return use.redundancy is not RedundancyMode.REPLICATE or use.budgeted
+    return not use.redundancy.uses_every_path or use.budgeted
 
 
 def asked_times(deadline_s: float) -> NDArray[np.float64]:

@@ -70,6 +70,7 @@ class _RedundancyModeEnumTypeWrapper(_enum_type_wrapper._EnumTypeWrapper[_Redund
     REDUNDANCY_MODE_BACKUP: _RedundancyMode.ValueType  # 2
     REDUNDANCY_MODE_HEDGE: _RedundancyMode.ValueType  # 3
     REDUNDANCY_MODE_ADAPTIVE: _RedundancyMode.ValueType  # 4
+    REDUNDANCY_MODE_SHARE: _RedundancyMode.ValueType  # 5
 
 class RedundancyMode(_RedundancyMode, metaclass=_RedundancyModeEnumTypeWrapper):
     """Which of the mapped pairs carry a copy of a request, and when (docs/use/redundancy.md)."""
@@ -80,6 +81,7 @@ REDUNDANCY_MODE_SINGLE: RedundancyMode.ValueType  # 1
 REDUNDANCY_MODE_BACKUP: RedundancyMode.ValueType  # 2
 REDUNDANCY_MODE_HEDGE: RedundancyMode.ValueType  # 3
 REDUNDANCY_MODE_ADAPTIVE: RedundancyMode.ValueType  # 4
+REDUNDANCY_MODE_SHARE: RedundancyMode.ValueType  # 5
 Global___RedundancyMode: _TypeAlias = RedundancyMode  # noqa: Y015
 
 @_typing.final

@@ -371,7 +371,7 @@ class Link:
             path.control_at,
             recovery.loss_timer if recovery.loss_timer is not None else recovery.pto_timer,
             path.silence_timer,
-            path.control.next_release(recovery.in_flight) if len(path.queue) and not path.address.is_blocked else None,
+            path.next_release if len(path.queue) and not path.address.is_blocked else None,
         )
         due = min(timer for timer in timers if timer is not None)
         self._timers.arm(path.id, due if due < NEVER else None)

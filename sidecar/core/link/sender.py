@@ -170,7 +170,8 @@ class DatagramBuilder:
                     self._add_control(path, path.take_control(now), burst, now)
                     allowance = address.allowance
                 budget = budget if allowance is None else min(budget, allowance)
-            run = queue.take(now, budget, control.pacing_rate or 0.0, recovery.rtt.smoothed)
+            pulls = path.state is PathState.UP
+            run = queue.take(now, budget, control.pacing_rate or 0.0, recovery.rtt.smoothed, pulls=pulls)
             if run is None:
                 control.ran_dry()
                 break
@@ -201,15 +202,15 @@ class DatagramBuilder:
                 return self._add_with_control(path, remote, control, run, burst, now)
             self._add_control(path, control, burst, now)
         if run.first < sources < end:  # the last source symbol may be shorter than what follows
-            head = self._add_symbols(path, remote, run.message, range(run.first, sources), burst, now)
-            return head + self._add_symbols(path, remote, run.message, range(sources, end), burst, now)
-        return self._add_symbols(path, remote, run.message, range(run.first, end), burst, now)
+            head = self._add_symbols(path, remote, run, range(run.first, sources), burst, now)
+            return head + self._add_symbols(path, remote, run, range(sources, end), burst, now)
+        return self._add_symbols(path, remote, run, range(run.first, end), burst, now)
 
     def _add_symbols(
-        self, path: Path, remote: Address, message: MessageSymbols, indices: range, burst: Burst, now: float
+        self, path: Path, remote: Address, run: SymbolRun, indices: range, burst: Burst, now: float
     ) -> int:
         """Build a datagram for each symbol, all but the last equally long, and seal each in place."""
-        count = len(indices)
+        message, count = run.message, len(indices)
         symbol, message_number, total = message.symbol, message.number, message.total
         left_us = _left_us(path, message, now)
         segment = FRAGMENT_OVERHEAD_BYTES + symbol
@@ -218,8 +219,8 @@ class DatagramBuilder:
         sealing.sealed += count
         head, seal_into = sealing.head, sealing.encrypt_into
         session = self.identity.session
-        kind, counted = (FRAGMENT_TYPE, "data") if indices.start < message.count else (REPAIR_TYPE, "repair")
-        self._stats.datagrams["sent", counted] += count
+        kind = FRAGMENT_TYPE if indices.start < message.count else REPAIR_TYPE
+        self._stats.datagrams["sent", _counted(run, indices.start)] += count
         pack, symbol_data = frame.FRAGMENT_DATAGRAM.pack_into, message.symbol_data
         buffer = bytearray(segment * count)
         end = 0
@@ -256,7 +257,7 @@ class DatagramBuilder:
         datagram = self._sealed(path, number, now, *control, head, symbol)
         size = len(datagram)
         path.recovery.on_run_sent(number, 1, now, size, size, message, index, _finished(control))
-        self._stats.datagrams["sent", "data" if index < message.count else "repair"] += 1
+        self._stats.datagrams["sent", _counted(run, index)] += 1
         burst.add(remote, datagram, size)
         self._sent(path, remote, size)
         return size
@@ -364,6 +365,13 @@ class DatagramBuilder:
         sealed = bytearray(len(plain) + TAG_BYTES)
         sealing.encrypt_into(clear[NONCE_OFFSET:], plain, clear, sealed)
         return clear + sealed
+
+
+def _counted(run: SymbolRun, index: int) -> str:
+    """Return the kind as which its symbols from this one on are counted."""
+    if run.repeats:
+        return "repeat"
+    return "data" if index < run.message.count else "repair"
 
 
 def _left_us(path: Path, message: MessageSymbols, now: float) -> int:

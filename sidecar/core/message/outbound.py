@@ -110,6 +110,8 @@ class OutboundMessage:
     def give_up(self) -> tuple[int, ...]:
         """Return what is missing, even if in flight: nobody will report it any more."""
         self._copies.clear()
+        if self.symbols.sharing is not None:
+            self.symbols.sharing.take_all()  # or it would travel twice
         return self.symbols.missing()
 
     def copied(self, indices: Iterable[int]) -> None:

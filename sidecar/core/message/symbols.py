@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 from plr.sidecar.core.base.timers import NEVER
 from plr.sidecar.core.base.values import Priority
+from plr.sidecar.core.message.sharing import Sharing
 from plr.sidecar.core.wire import fec
 from plr.sidecar.core.wire.frame import BASE_SYMBOL_BYTES, FRAGMENT_OVERHEAD_BYTES, MIN_SYMBOL_BYTES, symbol_count
 
@@ -37,6 +38,7 @@ class MessageSymbols:
         "over",
         "priority",
         "repairs",
+        "sharing",
         "siblings",
         "symbol",
         "total",
@@ -53,7 +55,9 @@ class MessageSymbols:
         symbol: int = BASE_SYMBOL_BYTES,
         repairs: int = 0,
         siblings: list[MessageSymbols] | None = None,
+        repeats: float | None = None,
     ) -> None:
+        """Cut the message. `repeats`: several paths carry it together, see `Sharing`, and repeat this share of it."""
         self.number = number
         self.content = content._replace(payload=memoryview(content.payload))
         self.total = content.size
@@ -75,6 +79,8 @@ class MessageSymbols:
         # A repair symbol is as long as the longest source symbol: make them equal.
         self.symbol = max(MIN_SYMBOL_BYTES, -(-self.total // self.count)) if repairs else symbol
         self.acked = bytearray(len(self))
+        self.sharing = None if repeats is None else Sharing(len(self), int(repeats * len(self)))
+        """What the paths that carry it together know of each other; None: each path carries what it is given."""
         self.begun = False
         """Whether some of it may have left."""
         self.over = False
@@ -132,6 +138,7 @@ class MessageSymbols:
             symbol=symbol,
             repairs=-(-self.repairs * symbol_count(self.total, symbol) // self.count),
             siblings=self.siblings if self.stand_down() else None,
+            repeats=None if self.sharing is None else self.sharing.repeats / len(self),
         )
 
     def symbol_data(self, index: int) -> bytes | memoryview:

@@ -305,6 +305,12 @@ class Path:
         return probe.sent_at
 
     @property
+    def next_release(self) -> float | None:
+        """When more of what waits may leave (s), even if past; None if only an acknowledgement lets it."""
+        at = self.control.next_release(self.recovery.in_flight)
+        return None if at is None else max(at, self.queue.rests_until)
+
+    @property
     def control_at(self) -> float:
         """When control frames leave on their own (s); NEVER if none wait or none may leave."""
         if self.address.is_blocked:

@@ -417,7 +417,7 @@ class RequestTable:
         if request.done or request.is_answered or request.id not in self._requests:
             return
         for copy in request.pending():
-            if self._parts.routes.state(copy.path) is not PathState.UP:
+            if self._parts.routes.best_state(copy.paths) is not PathState.UP:
                 copy.message.newest.stand_down()
         self._reconsider(request, now)
 

@@ -38,7 +38,10 @@ class LinkStats:
 
     interface: InterfaceName
     datagrams: Counter[tuple[str, str]] = field(default_factory=Counter)
-    """(direction: sent | received, kind: data | repair | control | stun); received repair symbols count as data."""
+    """(direction: sent | received, kind: data | repair | repeat | control | stun).
+
+    Received repair and repeated symbols count as data.
+    """
     dropped: Counter[str] = field(default_factory=Counter)
     """Datagrams by reason for the drop, received and unsendable ones alike."""
     bytes: Counter[str] = field(default_factory=Counter)

@@ -15,7 +15,7 @@ from plr.sidecar.core.transfer.room import Room
 from plr.sidecar.core.wire.frame import symbol_count
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Sequence
 
     from plr.protos.model.ids import InterfaceName, NodeName
     from plr.sidecar.core.base.slices import Step
@@ -113,6 +113,8 @@ class Outbox:
         answers: RequestId | None = None,
         copy_of: RequestId | None = None,
         siblings: list[MessageSymbols] | None = None,
+        shared_by: Sequence[PathId] = (),
+        repeats: float = 0.0,
     ) -> OutboundMessage:
         """Send a message over `path`, to a peer that has room for it: `has_room` and `admits` say which.
 
@@ -120,6 +122,7 @@ class Outbox:
         `answers`: the request that it answers, by which `drop_answers` finds it.
         `copy_of`: the request that it is a copy of.
         `siblings`: the messages that already carry the same request; it joins them.
+        `shared_by`: further paths to the same peer that carry it together with `path`, and repeat the share `repeats`.
         """
         size, loss = content.size, self._routes.loss(path)
         symbol = self._routes.symbol_to(path.peer)
@@ -136,9 +139,13 @@ class Outbox:
             symbol=symbol,
             repairs=repairs,
             siblings=siblings,
+            repeats=repeats if shared_by else None,
         )
         message = OutboundMessage(path, symbols, answers=answers, copy_of=copy_of)
         self._enter(message, loss)
+        for other in shared_by:
+            message.interfaces.add(other.interface)
+            self._command(Send(other, symbols))
         return message
 
     def _take_number(self) -> int:
@@ -154,9 +161,10 @@ class Outbox:
             self._answers.setdefault((peer, message.answers), []).append(message)
         self._room.take(message)
         self._command(Send(message.path, message.symbols))
-        if not message.symbols.repairs and worth_a_copy(1, loss):
+        symbols = message.symbols
+        if not symbols.repairs and symbols.sharing is None and worth_a_copy(1, loss):
             # It leaves before the others, so a burst does not take both.
-            self._send_copies(message, message.path, (message.symbols.count - 1,))
+            self._send_copies(message, message.path, (symbols.count - 1,))
 
     def on_finished(self, peer: NodeName, number: int) -> OutboundMessage | None:
         """Remove a message that the peer holds; None if it is not one of the peer's messages, or was already over."""

@@ -146,6 +146,10 @@ class Routes:
         route = self._routes.get(path)
         return PathState.DOWN if route is None else route.state
 
+    def best_state(self, paths: Iterable[PathId]) -> PathState:
+        """Return the liveness of the best of these paths."""
+        return min((self.state(path) for path in paths), key=_RANK.__getitem__, default=PathState.DOWN)
+
     def reaches(self, peer: NodeName) -> bool:
         """Return whether any path to the peer is not down."""
         return peer in self._reached

@@ -22,7 +22,7 @@ from plr.sidecar.core.wire.messages import RequestMessage, encode_message
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterable
 
-    from plr.protos.model.ids import NodeName
+    from plr.protos.model.ids import NodeName, ServiceName
     from plr.sidecar.core.base.values import PathId
     from plr.sidecar.core.robot.dispatch.context import RequestParts
 
@@ -54,6 +54,8 @@ class Dispatching:
         self._paces = PathPaces(parts.routes, parts.stats)
         self.adaptive = Adaptive(parts.routes, self._paces)
         self._budgets = Budgets(parts.budgets, parts.stats)
+        self._favourites: dict[ServiceName, NodeName] = {}
+        """The server to which shared requests of each service go."""
 
     def with_room(self, servers: Iterable[NodeName], request: Request) -> list[NodeName]:
         """Return those of the servers to which the request may be sent now."""
@@ -77,7 +79,10 @@ class Dispatching:
         rule = request.rule
         servers = self._favoured(servers, now)
         chosen = self._parts.mapping.choose(request.service, servers, idempotent=rule.idempotent)
-        if MODES[rule.redundancy].at_once:
+        mode = MODES[rule.redundancy]
+        if mode.shares is not None and not request.races and self._share(request, servers, chosen, mode.shares, now):
+            pass
+        elif mode.at_once:
             self._send_all(request, self._best_first(request, chosen, now) if self._budgets.limit else chosen, now)
         else:
             self._send_best(request, self._best_first(request, chosen, now), now)
@@ -113,6 +118,41 @@ class Dispatching:
         request.withheld = tuple(paths)
         if request.copies:
             MODES[request.rule.redundancy].begun(self, request, now)
+
+    def _share(
+        self,
+        request: Request,
+        servers: Collection[NodeName],
+        chosen: Collection[PathId],
+        repeats: float,
+        now: float,
+    ) -> bool:
+        """Send one copy to one of the servers over all interfaces of the chosen paths; return False if none is up."""
+        server = self._favourite(request.service, servers, chosen)
+        if server is None:
+            return False
+        first, *others = self._parts.mapping.up_to(server, chosen)
+        size = request.size
+        others = [path for path in others if self._budgets.allows(path.interface, request.service, size, now)]
+        self._send(request, first, now, _Why.MAPPED, shared_by=tuple(others), repeats=repeats)
+        request.withheld = tuple(path for path in chosen if path.peer != server)
+        return True
+
+    def _favourite(
+        self, service: ServiceName, servers: Collection[NodeName], chosen: Collection[PathId]
+    ) -> NodeName | None:
+        """Return the server that requests of the service went to last, while it may be asked and is reached.
+
+        Another one would begin with paths about which less is known, over the same networks.
+        """
+        favourite = self._favourites.get(service)
+        if favourite is not None and favourite in servers and self._parts.mapping.up_to(favourite, chosen):
+            return favourite
+        up = [path for path in chosen if self._parts.mapping.up_to(path.peer, chosen)]
+        if not up:
+            return None
+        self._favourites[service] = min(up, key=self._parts.routes.rtt).peer
+        return self._favourites[service]
 
     def _best_first(self, request: Request, paths: Iterable[PathId], now: float) -> list[PathId]:
         """Sort paths: those that are up first, among them the best by the mode, then the fastest."""
@@ -157,29 +197,32 @@ class Dispatching:
         waiting = request.relied_on()
         if request.is_answered or (waiting and not request.rule.redundancy.helps):
             return
+        if any(copy.shared_by and self._is_on_its_way(copy) for copy in waiting):
+            return  # over every interface already: another copy would take from it what it needs
         if rejected and len(request.copies) >= MAX_COPIES_OF_REQUEST:
             return  # its retry keeps asking, at a slower pace
-        alive = any(routes.state(copy.path) is not PathState.DOWN for copy in waiting)
+        alive = any(routes.best_state(copy.paths) is not PathState.DOWN for copy in waiting)
         if alive and not insist and MODES[request.rule.redundancy].watches(self, request, now):
             return
-        if not insist and any(routes.state(copy.path) is PathState.UP for copy in waiting):
+        if not insist and any(routes.best_state(copy.paths) is PathState.UP for copy in waiting):
             return
         path = self.next_withheld(request, now) or self._elsewhere(request, now, rejected=rejected)
         if path is None:
             path = self._take_back(request, waiting, now)
         if path is None:
             return
-        if any(copy.path.interface == path.interface and self._is_on_its_way(copy) for copy in waiting):
+        used = {each.interface for copy in waiting if self._is_on_its_way(copy) for each in copy.paths}
+        if path.interface in used:
             return  # another copy behind it would only delay it
         self._send(request, path, now, _Why.TROUBLE)
 
     def _is_on_its_way(self, copy: Copy) -> bool:
         """Return whether its server may not have all of it yet because its path is slow but not silent."""
-        return not copy.message.newest.over and self._parts.routes.state(copy.path) is PathState.UP
+        return not copy.message.newest.over and self._parts.routes.best_state(copy.paths) is PathState.UP
 
     def next_over_another_interface(self, request: Request, now: float) -> PathId | None:
         """Return the same, if none of the copies relied on uses its interface."""
-        used = {copy.path.interface for copy in request.relied_on()}
+        used = {path.interface for copy in request.relied_on() for path in copy.paths}
         path = self.next_withheld(request, now)
         return None if path is None or path.interface in used else path
 
@@ -234,7 +277,11 @@ class Dispatching:
     def answered(self, request: Request, copy: Copy, processing_s: float, now: float) -> None:
         """Note an answered copy. After its deadline it had to wait for fresher ones, so its pace means nothing."""
         latency_s = min(now - copy.sent_at, request.rule.deadline_s)
-        self._paces.answered(request.service, copy.path, latency_s, processing_s, now)
+        if not copy.shared_by:
+            self._paces.answered(request.service, copy.path, latency_s, processing_s, now)
+        elsewhere = [other.path.peer for other in request.relied_on() if other.message.newest.over]
+        if not request.races and self._favourites.get(request.service) in elsewhere:
+            self._favourites[request.service] = copy.path.peer  # the other one has the request and does not answer
 
     def ended(self, request: Request, now: float) -> None:
         """Note the outcome of the copies, once for each request: all are known, or the deadline is over."""
@@ -243,7 +290,16 @@ class Dispatching:
             paths = (*request.withheld, *(copy.path for copy in request.copies))
             self._budgets.earn(request.copies[0].message.symbols.total, {path.interface for path in paths})
 
-    def _send(self, request: Request, path: PathId, now: float, why: _Why) -> bool:
+    def _send(
+        self,
+        request: Request,
+        path: PathId,
+        now: float,
+        why: _Why,
+        *,
+        shared_by: tuple[PathId, ...] = (),
+        repeats: float = 0.0,
+    ) -> bool:
         """Send a copy for which the server has room; return whether the budgets and MAX_COPIES_OF_REQUEST allow it."""
         sent = len(request.copies)
         if request.payload is None or (sent >= MAX_COPIES_OF_REQUEST and sent >= _most_copies(request)):
@@ -274,14 +330,18 @@ class Dispatching:
             expires=expires,
             copy_of=request.id,
             siblings=request.messages if why in _PLANNED and not request.races else None,
+            shared_by=shared_by,
+            repeats=repeats,
         )
         explores = why is _Why.EXPLORATION
-        copy = Copy(path, now, message, explores=explores, hedges=why is _Why.HEDGE)
+        copy = Copy(path, now, message, explores=explores, shared_by=shared_by, hedges=why is _Why.HEDGE)
         request.copies.append(copy)
         self._parts.in_flight.add_copy(request, copy)
         request.withheld = tuple(other for other in request.withheld if other != path)
         if extra:
             self._budgets.spend(path.interface, request.size)
+        for other in shared_by:
+            self._budgets.spend(other.interface, request.size)  # at most
         stats.copy_bytes[path.interface, request.service, "extra" if extra else "first"] += request.size
         if explores:
             stats.explored[path.interface, path.peer, request.service] += 1

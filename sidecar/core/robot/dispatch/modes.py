@@ -52,6 +52,8 @@ class Mode:
     """Whether every mapped pair carries a copy from the start."""
     replaces_lost = False
     """Whether a copy of which nothing is heard is replaced before its path is known to be down."""
+    shares: float | None = None
+    """Paths of several interfaces carry one copy together, and repeat up to this share of it; None: they do not."""
 
     def slowness(self, sender: Sender, request: Request, path: PathId, now: float) -> float:
         """Return what the mapped paths that are up are sorted by, the best with the least."""
@@ -151,6 +153,17 @@ class AdaptiveMode(Mode):
         return True
 
 
+class Share(Backup):
+    """Sends one copy to one server over all mapped interfaces together; spare capacity repeats all of it.
+
+    Full races go over every mapped pair at once, so that each is measured.
+    """
+
+    at_once = True
+    replaces_lost = False
+    shares = 1.0
+
+
 class Replicate(Backup):
     """Sends a copy over every mapped pair at once (paper, section IV)."""
 
@@ -167,5 +180,6 @@ MODES: dict[RedundancyMode, Mode] = {
     RedundancyMode.BACKUP: Backup(),
     RedundancyMode.HEDGE: Hedge(),
     RedundancyMode.ADAPTIVE: AdaptiveMode(),
+    RedundancyMode.SHARE: Share(),
     RedundancyMode.REPLICATE: Replicate(),
 }

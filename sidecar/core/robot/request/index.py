@@ -45,7 +45,8 @@ class RequestIndex:
     def add_copy(self, request: Request, copy: Copy) -> None:
         """Add a copy that was sent; it is the last one of `request.copies`."""
         self._stranded.pop(request.id, None)
-        self._by_path.setdefault(copy.path, {})[request.id] = request
+        for path in copy.paths:
+            self._by_path.setdefault(path, {})[request.id] = request
         numbered = request.id, len(request.copies) - 1
         self._by_server.setdefault(copy.path.peer, {})[numbered] = request, copy
 
@@ -60,7 +61,8 @@ class RequestIndex:
         self._stranded.pop(request.id, None)
         _take_out(self._by_service, request.service, request.id)
         for number, copy in enumerate(request.copies):
-            _take_out(self._by_path, copy.path, request.id)
+            for path in copy.paths:
+                _take_out(self._by_path, path, request.id)
             _take_out(self._by_server, copy.path.peer, (request.id, number))
         return True
 

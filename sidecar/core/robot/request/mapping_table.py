@@ -13,7 +13,7 @@ from plr.protos.model.ids import Version
 from plr.sidecar.core.base.values import PathState
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Mapping
+    from collections.abc import Collection, Iterable, Mapping
 
     from plr.protos.model.ids import InterfaceName, NodeName, ServiceName
     from plr.protos.model.mapping import MappingSet, ServiceMapping
@@ -95,9 +95,17 @@ class MappingTable:
         if not routes:
             return routes
         server = next((route for route in routes if route.state is PathState.UP), routes[0]).id.peer
-        interfaces = dict.fromkeys(route.id.interface for route in routes)
+        return self._to(server, (route.id for route in routes))
+
+    def _to(self, server: NodeName, paths: Iterable[PathId]) -> list[Route]:
+        interfaces = dict.fromkeys(path.interface for path in paths)
         over = (self._routes.best_over(interface, server) for interface in interfaces)
         return [route for route in over if route is not None]
+
+    def up_to(self, server: NodeName, paths: Iterable[PathId]) -> list[PathId]:
+        """Return the paths to one server that are up, over the interfaces of these paths, the fastest first."""
+        routes = [route for route in self._to(server, paths) if route.state is PathState.UP]
+        return [route.id for route in sorted(routes, key=lambda route: route.order)]
 
     def rescue(self, servers: Collection[NodeName]) -> PathId | None:
         """Return the best path that is up to any of these servers, for a request whose copies are in trouble."""

@@ -69,6 +69,8 @@ class Copy:
     """When it was answered or called off."""
     explores: bool = False
     """It was sent to explore a path that is not used otherwise: nothing relies on it."""
+    shared_by: tuple[PathId, ...] = ()
+    """Further paths that carry it. It shows none of them alone, and is not measured."""
     hedges: bool = False
     """It was sent because another one took long. It shows its path at such a moment only, and is not measured."""
     forecast_s: float | None = None
@@ -80,6 +82,11 @@ class Copy:
 
     def __post_init__(self) -> None:
         self.progress_at = self.sent_at
+
+    @property
+    def paths(self) -> tuple[PathId, ...]:
+        """All paths that carry it."""
+        return (self.path, *self.shared_by)
 
     @property
     def refused(self) -> bool:
@@ -188,9 +195,10 @@ class Request:
     def choose_observation(self) -> None:
         """Decide, when the first copies go out, whether this request is a full race.
 
-        A single copy has nothing to lose against, unless it may be hedged.
+        A single copy has nothing to lose against, unless it may be hedged. One that several paths carry measures none.
         """
-        self.observed = self.races or (len(self.copies) < 2 and not self.rule.redundancy.sends_late)
+        alone = len(self.copies) < 2 and not any(copy.shared_by for copy in self.copies)
+        self.observed = self.races or (alone and not self.rule.redundancy.sends_late)
 
     def started_together(self) -> list[Copy]:
         """Return the copies sent when the request came, or when there was a path at last."""

@@ -40,7 +40,7 @@ BAD_VALUES: list[tuple[dict[str, Any], str, str]] = [
     (with_service(ROBOT, target_miss=0.1), "services[0].target_miss", "only beside mode: cheapest or"),
     (with_service(ROBOT, mode="cheapest", target_miss=0), "services[0].target_miss", "greater than 0"),
     (with_service(ROBOT, mode="cheapest", target_miss=1.0), "services[0].target_miss", "less than 1"),
-    (with_service(ROBOT, redundancy="all"), "services[0].redundancy", "'hedge', 'adaptive' or 'replicate'"),
+    (with_service(ROBOT, redundancy="all"), "services[0].redundancy", "'adaptive', 'share' or 'replicate'"),
     (with_service(ROBOT, redundancy="hedge"), "services[0].redundancy", "beside idempotent: true only"),
     (with_service(ROBOT, redundancy="adaptive"), "services[0].redundancy", "expected adaptive beside idempotent: true"),
     (with_service(CLOUD, redundancy="single"), "services[0].redundancy", "on a robot only"),

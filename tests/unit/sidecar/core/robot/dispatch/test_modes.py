@@ -8,12 +8,13 @@ import pytest
 
 from plr.protos.model.redundancy_mode import RedundancyMode
 from plr.sidecar.core.base.values import PathId, PathState, RejectReason
-from plr.sidecar.core.robot.request.request import HEDGE_AT
+from plr.sidecar.core.robot.request.request import HEDGE_AT, Request
 from plr.sidecar.core.rules.budget import Budget
-from tests.support.builders import ECHO, WLAN, WWAN, A, B, path
+from tests.support.builders import ECHO, WLAN, WWAN, A, B, path, request_id
 from tests.unit.sidecar.core.request_table import RACE, WLAN_A, WWAN_B, Table
 
 WWAN_A = path(WWAN, A)
+WLAN_B = path(WLAN, B)
 
 
 def table_with(mode: RedundancyMode, *, idempotent: bool = True, budgets: tuple[Budget, ...] = ()) -> Table:
@@ -179,3 +180,69 @@ def test_extra_copies_and_their_bytes_are_counted() -> None:
     first, extra = table.stats.copy_bytes[WLAN, ECHO, "first"], table.stats.copy_bytes[WWAN, ECHO, "extra"]
     assert first == extra
     assert 1000 < first < 1200
+
+
+def sharing_table(*, budgets: tuple[Budget, ...] = ()) -> Table:
+    """Each interface reaches each server."""
+    table = table_with(RedundancyMode.SHARE, budgets=budgets)
+    for known, rtt_s in ((WWAN_A, 0.03), (WLAN_B, 0.04)):
+        table.routes.set_state(known, PathState.UP)
+        table.routes.set_rtt(known, rtt_s)
+    return table
+
+
+def in_flight(table: Table, number: int = 1) -> Request:
+    request = table.parts.in_flight.get(request_id(number))
+    assert request is not None
+    return request
+
+
+def test_a_shared_request_goes_to_one_server_over_every_mapped_interface_as_one_message() -> None:
+    table = sharing_table()
+    table.submit()
+    request = in_flight(table)
+    assert table.sent() == [WLAN_A, WWAN_A]
+    assert [copy.paths for copy in request.copies] == [(WLAN_A, WWAN_A)]
+    assert not request.observed, "it measures neither path"
+
+
+def test_a_race_of_shared_requests_measures_each_mapped_pair() -> None:
+    table = sharing_table()
+    table.submit(RACE)
+    assert table.sent() == [WLAN_A, WWAN_B]
+    assert in_flight(table, RACE).observed
+
+
+def test_shared_requests_stay_with_their_server_though_another_becomes_faster() -> None:
+    table = sharing_table()
+    table.submit(1)
+    table.routes.set_rtt(WWAN_B, 0.001)
+    table.submit(2)
+    assert table.sent() == [WLAN_A, WWAN_A] * 2
+
+
+def test_shared_requests_follow_the_server_that_answers_what_the_other_one_holds() -> None:
+    table = sharing_table()
+    table.submit(1)
+    in_flight(table).copies[0].message.end()
+    table.handle_timers(HEDGE_AT * table.rule.deadline_s)
+    assert table.sent() == [WLAN_A, WWAN_A, WWAN_B]
+    table.respond(number=1, copy=1, server=B, now=0.6)
+    assert table.sent() == [WLAN_A], "the copy there is called off"
+    table.submit(2, now=0.7)
+    assert table.sent() == [WWAN_B, WLAN_B]
+
+
+def test_a_shared_request_is_in_trouble_when_all_its_paths_are() -> None:
+    table = sharing_table()
+    table.submit()
+    table.change(WLAN_A, PathState.DOWN)
+    assert table.sent() == [WLAN_A, WWAN_A]
+    table.change(WWAN_A, PathState.UNSTABLE)
+    assert table.sent() == [WWAN_B]
+
+
+def test_an_interface_without_budget_does_not_share() -> None:
+    table = sharing_table(budgets=(Budget(WWAN, extra_bytes_a_day=0),))
+    table.submit()
+    assert table.sent() == [WLAN_A]

@@ -1,0 +1,131 @@
+"""One message on the queues of two paths that carry it together."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from plr.sidecar.core.message.sharing import OFFER_S
+from plr.sidecar.core.path.send_queue import SendQueue
+from tests.support.builders import message
+
+if TYPE_CHECKING:
+    from plr.sidecar.core.message.symbols import MessageSymbols
+
+ONE = 1
+"""A budget for one symbol."""
+MUCH = 1_000_000
+PACE = 1_000_000.0
+RTT_S = 0.02
+
+
+def shared(repeats: float = 1.0, size: int = 12_000, number: int = 1, deadline: float = 5.0) -> MessageSymbols:
+    return message(number, size, deadline=deadline, repeats=repeats)
+
+
+def both(*messages: MessageSymbols) -> tuple[SendQueue, SendQueue]:
+    queues = SendQueue(), SendQueue()
+    for queue in queues:
+        for each in messages:
+            queue.add(each)
+    return queues
+
+
+def take(
+    queue: SendQueue, budget: int = ONE, now: float = 0.0, pace: float = PACE, rtt_s: float = RTT_S
+) -> tuple[int, int, int] | None:
+    run = queue.take(now, budget, pace, rtt_s)
+    return None if run is None else (run.message.number, run.first, run.symbols)
+
+
+def test_each_path_takes_what_it_has_room_for() -> None:
+    first, second = both(shared())
+    assert take(first) == (1, 0, 1)
+    assert take(second, 3 * 1300) == (1, 1, 3)
+    assert take(first) == (1, 4, 1)
+
+
+def test_spare_time_repeats_the_newest_that_only_the_other_carries() -> None:
+    outbound = shared()
+    first, second = both(outbound)
+    assert take(first, MUCH) == (1, 0, outbound.count)
+    assert take(second) == (1, outbound.count - 1, 1)
+    outbound.acked[outbound.count - 2] = 1
+    assert take(second, 2 * 1300) == (1, outbound.count - 4, 2)
+    assert take(first) is None, "it has carried all of it"
+    assert len(first) == 0
+
+
+def test_no_more_is_repeated_than_allowed() -> None:
+    outbound = shared(repeats=0.25)
+    first, second = both(outbound)
+    take(first, MUCH)
+    again = 0
+    while (run := take(second, MUCH)) is not None:
+        again += run[2]
+    assert again == outbound.count // 4
+    assert len(second) == 0
+
+
+def test_what_can_still_be_taken_goes_before_what_may_be_repeated() -> None:
+    begun, later = shared(), shared(number=2, deadline=9.0)
+    first, second = both(begun, later)
+    take(first, MUCH)
+    assert take(second) == (2, 0, 1)
+
+
+def test_a_slow_path_leaves_the_end_to_a_fast_one_and_repeats_only() -> None:
+    outbound = shared(repeats=0.0)
+    fast, slow = both(outbound)
+    assert take(fast) == (1, 0, 1)
+    assert take(slow, rtt_s=1.0) is None
+    assert len(slow) == 1
+    assert slow.rests_until == OFFER_S
+    assert take(fast, MUCH) == (1, 1, outbound.count - 1)
+
+
+def test_a_slow_path_goes_on_when_the_fast_one_has_no_room_any_more() -> None:
+    fast, slow = both(shared(repeats=0.0))
+    take(fast)
+    assert take(slow, rtt_s=1.0) is None
+    assert take(slow, now=2 * OFFER_S, rtt_s=1.0) == (1, 1, 1)
+    assert slow.rests_until == 0.0
+
+
+def test_a_path_that_dies_hands_back_only_what_nobody_else_takes() -> None:
+    outbound = shared()
+    first, second = both(outbound)
+    take(first)
+    first.resend(outbound, (0,))
+    assert first.clear() == [(outbound, (0,))]
+    assert second.clear() == [(outbound, tuple(range(1, outbound.count)))]
+
+
+def test_what_is_sent_again_goes_first_also_on_a_path_that_had_finished() -> None:
+    outbound = shared()
+    first, second = both(outbound)
+    take(first, MUCH)
+    assert take(second) == (1, outbound.count - 1, 1)
+    second.resend(outbound, (0,))
+    assert take(second) == (1, 0, 1)
+    assert take(first) is None
+    first.resend(outbound, (3,))
+    assert take(first, MUCH) == (1, 3, 1)
+    assert take(first, MUCH) is None, "what it carried before is not repeated"
+
+
+def test_what_all_paths_together_can_do_in_time_is_fresh() -> None:
+    pace = 10_000.0  # 1.2 s for 12 kB alone, 0.6 s together
+    slow, other = both(shared(deadline=1.0, number=1), shared(deadline=9.0, number=2))
+    assert take(slow, pace=pace) == (2, 0, 1), "alone it is hopeless"
+    assert take(other, pace=pace, rtt_s=0.0) == (1, 0, 1)
+    assert take(slow, pace=pace, rtt_s=0.0) == (1, 1, 1)
+
+
+def test_what_is_over_is_forgotten_and_what_expired_is_not_repeated() -> None:
+    over, expired = shared(), message(2, 12_000, deadline=1.0, expires=2.0, repeats=1.0)
+    first, second = both(over, expired)
+    take(first, MUCH)
+    take(first, MUCH)
+    over.over = True
+    assert take(second, now=3.0) is None
+    assert len(second) == 0
