@@ -259,7 +259,7 @@ def _fallback(content: Content) -> str:
     late = content.get("fallback_late")
     if late is None:
         return NOTHING
-    return f"Late with a fallback where both networks are poor: {late} {content['from']['fallback_late']}."
+    return f"Requests without an answer by the deadline: {late} {content['from']['fallback_late']}."
 
 
 _BLOCKS: dict[str, Callable[[Content], str]] = {
