@@ -72,11 +72,14 @@ def _same_drives(content: Content, one: Mapping[str, Any]) -> str:
         for name, figures in found.items()
         if name != ORACLE
     )
-    gains = [_number(one[key]) for key in ("median_mean_gain", "median_p99_gain")]
+    gains = [
+        NOT_MEASURED if one[key] is None else f"{_number(one[key])} times lower"
+        for key in ("median_mean_gain", "median_p99_gain")
+    ]
     return (
         f"{about} {_UNANSWERED}\n\n{table_as_markdown(Table('', columns, rows))}"
-        f"\nCompared with the better direct run of the same window, `{SUREST}`'s mean is {gains[0]} times lower, "
-        f"and its P99 {gains[1]} times (medians of the {len(windows)} windows).{_beside_oracle(found)}"
+        f"\nCompared with the better direct run of the same window, `{SUREST}`'s mean is {gains[0]}, and its "
+        f"P99 is {gains[1]} (medians of the {len(windows)} windows).{_beside_oracle(found)}"
     )
 
 
