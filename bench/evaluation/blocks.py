@@ -58,7 +58,7 @@ def _same_drives(content: Content, one: Mapping[str, Any]) -> str:
     if windows == content["everywhere"][0]["windows"]:
         about = f"All {len(windows)} windows of recorded drives, {requests} requests each{_distinct(content)}."
     else:
-        about = f"The {len(windows)} windows in which every mode ran; a direct run misses something in {hard} of them."
+        about = f"Every mode ran in {len(windows)} windows. In {hard} of them, a direct run misses a request."
     columns = ("", "missed", "each drive alike", "never answered", "mean", "P50", "P99", "P99, median window", "kB")
     rows = tuple(
         (
@@ -72,11 +72,14 @@ def _same_drives(content: Content, one: Mapping[str, Any]) -> str:
         for name, figures in found.items()
         if name != ORACLE
     )
-    gains = [_number(one[key]) for key in ("median_mean_gain", "median_p99_gain")]
+    gains = [
+        NOT_MEASURED if one[key] is None else f"{_number(one[key])} times lower"
+        for key in ("median_mean_gain", "median_p99_gain")
+    ]
     return (
         f"{about} {_UNANSWERED}\n\n{table_as_markdown(Table('', columns, rows))}"
-        f"\nHow many times lower than that of the better direct run of the same window, median of the {len(windows)}: "
-        f"`{SUREST}`'s mean {gains[0]}, its P99 {gains[1]}.{_beside_oracle(found)}"
+        f"\nCompared with the better direct run of the same window, `{SUREST}`'s mean is {gains[0]}, and its "
+        f"P99 is {gains[1]} (medians of the {len(windows)} windows).{_beside_oracle(found)}"
     )
 
 
@@ -84,10 +87,10 @@ def _beside_oracle(found: Mapping[str, Mapping[str, Any]]) -> str:
     if ORACLE not in found:
         return ""
     ours, least = (found[name]["miss_ratio"] for name in (SUREST, ORACLE))
-    times = f", {least / ours * 100:.0f} % of what `{SUREST}` misses" if ours else ""
+    times = f" This is {least / ours * 100:.0f} % of what `{SUREST}` misses." if ours else ""
     return (
-        f"\nAn oracle that knows what each path will bear, and shares every request out over both, misses "
-        f"{_percent(least)}{times}."
+        f"\nAn oracle that knows what each path will carry, and splits every request between both paths, misses "
+        f"{_percent(least)}.{times}"
     )
 
 
@@ -252,14 +255,17 @@ def _budgets(content: Content) -> str:
     share = content.get("budget_extra_share")
     if share is None:
         return NOTHING
-    return f"Extra copies with `extra_load: 0.1`, at most: {_percent(share)} ({content['from']['budget_extra_share']})."
+    return (
+        f"Largest share of extra copies with `extra_load: 0.1`: {_percent(share)} "
+        f"({content['from']['budget_extra_share']})."
+    )
 
 
 def _fallback(content: Content) -> str:
     late = content.get("fallback_late")
     if late is None:
         return NOTHING
-    return f"Late with a fallback where both networks are poor: {late} {content['from']['fallback_late']}."
+    return f"Requests without an answer by the deadline: {late} {content['from']['fallback_late']}."
 
 
 _BLOCKS: dict[str, Callable[[Content], str]] = {
