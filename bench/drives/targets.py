@@ -6,9 +6,9 @@ this was written (`before.json`). *Ours* is the mode that is the default.
 
 One definition changed after the first runs, before ours were judged by it. The first one asked for at most half of
 replicate's misses over all windows. No policy can have that on the judged half: even the clairvoyant oracle misses 0.54
-of them, most in a single window. The figure over all windows stays in `drives.json`, without a target. The one with a target
-counts the windows in which half is *attainable*: the causal oracle that repairs, which knows no more than a sender can,
-misses at most half of replicate's there.
+of them, most in a single window. The figure over all windows stays in `drives.json`, without a target. The one with a
+target counts the windows in which half is *attainable*: the causal oracle that repairs, which knows no more than a
+sender can, misses at most half of replicate's there.
 """
 
 from __future__ import annotations

@@ -26,6 +26,13 @@ def test_adaptive_avoids_what_replicate_avoids_for_a_fraction_of_its_bytes(scena
     assert replicate.sent > 1.4 * single.sent
 
 
+def test_sharing_avoids_more_than_replicate_for_fewer_bytes(scenario: Scenario) -> None:
+    share, replicate = (drive(scenario, mode) for mode in (RedundancyMode.SHARE, RedundancyMode.REPLICATE))
+    assert share.misses <= replicate.misses
+    assert share.outcome.figures().mean_ms < replicate.outcome.figures().mean_ms
+    assert share.sent < replicate.sent
+
+
 def test_adaptive_keeps_its_budget(scenario: Scenario) -> None:
     run = drive(scenario, RedundancyMode.ADAPTIVE, budget=Budget("*", extra_load=0.05))
     assert 0.03 * run.copies.first < run.copies.extra <= 2 * 0.05 * run.copies.first, (
