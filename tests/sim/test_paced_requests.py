@@ -9,7 +9,7 @@ import pytest
 
 from lab.simulated.mesh import Mesh, Node, Wire, rule
 from plr.sidecar.core.path.congestion.model_controller import ModelController
-from plr.sidecar.core.path.send_queue import Turn
+from plr.sidecar.core.path.turn import Turn
 
 if TYPE_CHECKING:
     from plr.sidecar.core.base.values import ExecutionId, RequestId

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from plr.protos.trust.credential import SessionCredential
     from plr.sidecar.core.message.symbols import MessageSymbols
     from plr.sidecar.core.path.path import Path
-    from plr.sidecar.core.path.send_queue import SymbolRun
+    from plr.sidecar.core.path.turn import SymbolRun
     from plr.sidecar.core.seam.stats import LinkStats
 
 BURST_DATAGRAMS = 64

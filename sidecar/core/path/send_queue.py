@@ -20,219 +20,23 @@ repeats what the others carry of such messages.
 from __future__ import annotations
 
 import heapq
-from collections import deque
 from itertools import count
-from typing import TYPE_CHECKING, NamedTuple, TypeAlias
+from typing import TYPE_CHECKING, TypeAlias
 
-from plr.sidecar.core.base.timers import NEVER
 from plr.sidecar.core.base.values import SHARE, Priority
-from plr.sidecar.core.message.sharing import OFFER_S
-from plr.sidecar.core.wire.frame import FRAGMENT_OVERHEAD_BYTES
+from plr.sidecar.core.path.spare_time import SpareTime
+from plr.sidecar.core.path.turn import LOOK_AGAIN_S, MAX_RUN, SharedTurn, SymbolRun, most_symbols, turn_of
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
-    from plr.sidecar.core.message.sharing import Sharing
     from plr.sidecar.core.message.symbols import MessageSymbols
-
-HASTE = 1.25
-"""A message that has not begun to leave is late when this many times its sending time no longer fits: a message that
-begins should also finish."""
-PATIENCE = 0.5
-"""An answer that another path expects is overdue after this share of the time between the expected answer and the
-deadline: there should be time left for this path."""
-
-SMALL = 0.1
-"""A message that takes less than this share of the remaining time is sent at once anyway: others hardly wait for it."""
-
-
-class Turn:
-    """One message on one path."""
-
-    __slots__ = ("_end", "again", "begun", "message", "next")
-
-    def __init__(self, message: MessageSymbols) -> None:
-        self.message = message
-        self.next = 0
-        self._end = len(message)
-        self.again: deque[int] = deque()
-        """Symbols to be sent once more."""
-        self.begun = False
-        """Whether some of its symbols have left."""
-
-    def take(self, most: int) -> tuple[int, int] | None:
-        """Remove and return the next consecutive symbols as (first, count), at most `most`; None if none is left."""
-        needs = self.message.needs
-        again = self.again
-        while again:
-            first = again.popleft()
-            if needs(first):
-                end = first + 1
-                while again and again[0] == end and end - first < most and needs(end):
-                    again.popleft()
-                    end += 1
-                return first, end - first
-        last = self._end
-        first = self.next
-        while first < last and not needs(first):
-            first += 1
-        end = first
-        limit = min(last, first + most)
-        while end < limit and needs(end):
-            end += 1
-        self.next = end
-        return (first, end - first) if end > first else None
-
-    @property
-    def has_left(self) -> bool:
-        """Whether each of its symbols that were queued has left."""
-        return not self.again and self.next >= len(self.message)
-
-    def leave(self) -> tuple[int, ...]:
-        """Leave the path; return the symbols that still have to travel and that no other path would carry."""
-        self.waits()
-        return tuple(filter(self.message.needs, (*self.again, *range(self.next, self._end))))
-
-    def can_end_by(self, end: float, now: float, pace: float, round_trip_s: float) -> bool:
-        """Return whether its last symbol can be answered before `end` at this pace (bytes a second; 0: unknown)."""
-        if not pace:
-            return now < end
-        sending_s = self._sending_s(pace) * (1.0 if self.begun else HASTE)
-        return now + sending_s + round_trip_s < end
-
-    def goes_on(self, now: float, pace: float, round_trip_s: float) -> None:
-        """Tell its siblings when to expect the answer: some of it has been taken to be sent."""
-        self.begun = True
-        self.message.expected_at = now + self._sending_s(pace) + round_trip_s if pace else NEVER
-
-    def waits(self) -> None:
-        """Withdraw the expected answer: something else goes first."""
-        self.message.expected_at = NEVER
-
-    def covered_until(self, now: float, pace: float, round_trip_s: float) -> float | None:
-        """Return until when to leave it to a path that expects the answer in time and sooner; None: not at all."""
-        message = self.message
-        if len(message.siblings) < 2 or not pace:
-            return None
-        deadline = message.deadline
-        sending_s = self._sending_s(pace)
-        if sending_s < SMALL * (deadline - now):
-            return None
-        here = min(deadline, now + sending_s + round_trip_s)
-        for other in message.siblings:
-            expected_at = other.expected_at
-            if expected_at < here and other is not message:
-                overdue_at = expected_at + PATIENCE * (deadline - expected_at)
-                if now < overdue_at:
-                    return overdue_at
-        return None
-
-    def _sending_s(self, pace: float) -> float:
-        return (len(self.again) + self._end - self.next) * self.message.symbol / pace
-
-
-class SharedTurn(Turn):
-    """One message on one of the paths that carry it together (`message/sharing.py`)."""
-
-    __slots__ = ("_carried", "_newest", "_sharing")
-
-    def __init__(self, message: MessageSymbols, sharing: Sharing, *, repeats: bool) -> None:
-        """Join the paths that carry the message; `repeats`: repeat in spare time what the others carry."""
-        super().__init__(message)
-        self.next = self._end
-        self._sharing = sharing
-        self._carried = bytearray(len(message))
-        """Symbols that left over this path."""
-        self._newest = self._end - 1 if repeats else -1
-        """Each later symbol has left over this path or arrived."""
-        sharing.join(self)
-
-    def take(self, most: int) -> tuple[int, int] | None:
-        """Remove and return what was to be sent once more, or the next symbols that no other path has taken."""
-        run = super().take(most) if self.again else None
-        return self._note(self._sharing.take(most, self.message.needs) if run is None else run)
-
-    def _note(self, run: tuple[int, int] | None) -> tuple[int, int] | None:
-        if run is not None:
-            self._carried[run[0] : sum(run)] = b"\1" * run[1]
-        return run
-
-    def repeat(self, most: int) -> tuple[int, int] | None:
-        """Return the newest symbols that only other paths have carried so far, as `take` does; None: nothing is left.
-
-        Among them may be some that no path has taken yet, while this one leaves them to the others.
-        """
-        carried, acked, last = self._carried, self.message.acked, self._newest
-        while last >= 0 and (carried[last] or acked[last]):
-            last -= 1
-        self._newest = last
-        most = min(most, self._sharing.repeats)
-        if most <= 0 or last < 0 or self.message.over:
-            return None
-        first = last
-        while first and last - first + 1 < most and not (carried[first - 1] or acked[first - 1]):
-            first -= 1
-        self._sharing.repeats -= last - first + 1
-        return self._note((first, last - first + 1))
-
-    @property
-    def has_left(self) -> bool:
-        """Whether it has nothing to send before the spare time."""
-        return not self.again and not self._sharing.untaken
-
-    def leave(self) -> tuple[int, ...]:
-        """See `Turn.leave`."""
-        return tuple(filter(self.message.needs, (*self.again, *self._sharing.leave(self))))
-
-    def can_end_by(self, end: float, now: float, pace: float, round_trip_s: float) -> bool:
-        """Return whether all paths together can have it answered before `end`; tell the others what this one can do."""
-        self._sharing.offer(self, pace, round_trip_s, now)
-        others, their_round_trip_s = self._sharing.others(self, now)
-        if others:
-            round_trip_s = min(round_trip_s, their_round_trip_s)
-        return super().can_end_by(end, now, pace and pace + others, round_trip_s)
-
-    def goes_on(self, _now: float, _pace: float, _round_trip_s: float) -> None:
-        """Note that some of it has been taken to be sent."""
-        self.begun = True
-
-    def waits(self) -> None:
-        """Tell the other paths not to rely on this one: something else goes first."""
-        self._sharing.withdraw(self)
-
-    def covered_until(self, now: float, pace: float, round_trip_s: float) -> float | None:
-        """Return until when to leave it to the others, which would be done before a symbol sent here arrives."""
-        others, their_round_trip_s = self._sharing.others(self, now)
-        if not others or self.again:
-            return None
-        symbol = self.message.symbol
-        others_s = self._sharing.untaken * symbol / others + their_round_trip_s
-        return now + OFFER_S if others_s < round_trip_s + symbol / max(pace, 1.0) else None
-
-    def _sending_s(self, pace: float) -> float:
-        return (len(self.again) + self._sharing.untaken) * self.message.symbol / pace
-
+    from plr.sidecar.core.path.turn import Turn
 
 PURGE_AT = 64
 """Entries that trigger the first search for messages that are over; the next one comes at twice their number."""
 BEGUN = float("-inf")
 """Sort key of begun messages, before the other late ones."""
-MAX_RUN = 64
-"""Symbols in a run, as many as one offload has segments."""
-MAX_RUN_BYTES = 65_000
-"""Bytes in a run: the largest UDP payload, less a margin for other frames."""
-
-
-class SymbolRun(NamedTuple):
-    """Consecutive symbols of one message, to be sent in sequence."""
-
-    message: MessageSymbols
-    first: int
-    symbols: int
-    repeats: bool = False
-    """Other paths carry them as well; they leave because there is time to spare."""
-
-
 _Entry: TypeAlias = "tuple[float, int, Turn]"
 """Sort key, order of arrival, and message."""
 
@@ -269,13 +73,12 @@ class _Class:
 class SendQueue:
     """Symbols that wait for one path. The outbox limits the number of messages."""
 
-    __slots__ = ("_classes", "_entries", "_idle", "_order", "_pulls", "_purge_at", "expired", "rests_until")
+    __slots__ = ("_classes", "_entries", "_order", "_pulls", "_purge_at", "_spare_time", "expired", "rests_until")
 
     def __init__(self) -> None:
         self._classes = tuple(_Class() for _ in Priority)
         self._entries: dict[int, Turn] = {}
-        self._idle: dict[int, SharedTurn] = {}
-        """What may be repeated in spare time, or is left to other paths at present; among `_entries` as well."""
+        self._spare_time = SpareTime(self._entries)
         self.rests_until = 0.0
         """Nothing leaves before this time unless something is added: the rest is left to other paths."""
         self._pulls = True
@@ -290,16 +93,16 @@ class SendQueue:
     def add(self, message: MessageSymbols) -> None:
         """Queue all symbols of a message."""
         if message.number not in self._entries:
-            self._insert(_turn(message, repeats=True))
+            self._insert(turn_of(message, repeats=True))
 
     def resend(self, message: MessageSymbols, indices: Iterable[int]) -> None:
         """Queue these symbols of a message again, before its others."""
         entry = self._entries.get(message.number)
         if entry is None:
-            entry = _turn(message, repeats=False)
+            entry = turn_of(message, repeats=False)
             entry.next = len(message)
             self._insert(entry)
-        elif self._idle.pop(message.number, None) is not None:
+        elif self._spare_time.remove(message.number):
             self._insert(entry)
         entry.again.extend(indices)
 
@@ -322,8 +125,9 @@ class SendQueue:
                 heapq.heapify(heap)
             each.newest[:] = [item for item in each.newest if not item[2].message.over]
             heapq.heapify(each.newest)
-        self._entries = {number: entry for number, entry in self._entries.items() if not entry.message.over}
-        self._idle = {number: entry for number, entry in self._idle.items() if not entry.message.over}
+        for number in [number for number, entry in self._entries.items() if entry.message.over]:
+            del self._entries[number]
+        self._spare_time.purge()
         self._purge_at = max(PURGE_AT, 2 * len(self._entries))
 
     def take(
@@ -335,9 +139,14 @@ class SendQueue:
         `round_trip_s` tell which can still make their deadline. `pulls`: the path is up, and may take what others could
         carry as well.
         """
-        self._pulls = pulls
-        if self._idle and now >= self.rests_until:
-            self._wake(now, pace, round_trip_s)
+        if pulls is not self._pulls:
+            self._pulls, self.rests_until = pulls, 0.0
+        for entry in self._spare_time.due(now):
+            until = self._left_to_others(entry, now, pace, round_trip_s)
+            if until is None:
+                self._insert(entry)
+            else:
+                self._spare_time.add(entry, until)
         waiting = [
             each for each in self._classes if any(each.heaps) and self._head(each, now, pace, round_trip_s) is not None
         ]
@@ -353,34 +162,10 @@ class SendQueue:
                 continue
             self._note_turn(waiting, chosen, run.symbols)
             return run
-        return self._repeat(now, budget, round_trip_s) if self._idle else None
-
-    def _wake(self, now: float, pace: float, round_trip_s: float) -> None:
-        """Line up again what the other paths do not carry soon enough after all."""
-        for number, entry in list(self._idle.items()):
-            if entry.message.over:
-                self._idle.pop(number, None)
-                self._entries.pop(number, None)
-            elif not entry.has_left and self._left_to_others(entry, now, pace, round_trip_s) is None:
-                del self._idle[number]
-                self._insert(entry)
-
-    def _repeat(self, now: float, budget: int, round_trip_s: float) -> SymbolRun | None:
-        """Return symbols that other paths carry, of the message that is most urgent and can still be in time."""
-
-        def urgency(entry: SharedTurn) -> tuple[bool, float]:
-            return entry.message.deadline <= now + round_trip_s, entry.message.deadline
-
-        for entry in sorted(self._idle.values(), key=urgency):
-            message = entry.message
-            run = entry.repeat(_most_symbols(message, budget)) if message.expires > now else None
-            if run is not None:
-                return SymbolRun(message, *run, repeats=True)
-            if entry.has_left:
-                entry.leave()
-                del self._idle[message.number], self._entries[message.number]
-        self.rests_until = now + OFFER_S
-        return None
+        run = self._spare_time.take(now, budget, round_trip_s)
+        if run is None and self._entries:
+            self.rests_until = self._spare_time.next_look
+        return run
 
     def _note_turn(self, waiting: list[_Class], chosen: _Class, symbols: int) -> None:
         higher = True
@@ -397,7 +182,7 @@ class SendQueue:
         while (heap := self._head(chosen, now, pace, round_trip_s)) is not None:
             entry = heap[0][2]
             message = entry.message
-            run = entry.take(min(most, _most_symbols(message, budget)))
+            run = entry.take(min(most, most_symbols(message, budget)))
             if run is not None:
                 entry.goes_on(now, pace, round_trip_s)
                 if entry.has_left:
@@ -413,7 +198,7 @@ class SendQueue:
         entry = heap[0][2]
         if isinstance(entry, SharedTurn):
             heapq.heappop(heap)
-            self._idle[entry.message.number] = entry
+            self._spare_time.add(entry)
         else:
             self._drop(heap)
 
@@ -444,7 +229,7 @@ class SendQueue:
                     entry.waits()
                     heapq.heappop(heap)
                     if isinstance(entry, SharedTurn):
-                        self._idle[message.number] = entry
+                        self._spare_time.add(entry, until)
                     else:
                         heapq.heappush(covered, (until, order, entry))
                 elif not entry.can_end_by(message.deadline, now, pace, round_trip_s):
@@ -460,7 +245,7 @@ class SendQueue:
     def _left_to_others(self, entry: Turn, now: float, pace: float, round_trip_s: float) -> float | None:
         """Return until when to leave it to other paths; None: not at all."""
         if not self._pulls and isinstance(entry, SharedTurn) and not entry.again:
-            return now + OFFER_S
+            return now + LOOK_AGAIN_S
         return entry.covered_until(now, pace, round_trip_s)
 
     def _hope_again(self, each: _Class, now: float, pace: float, round_trip_s: float) -> None:
@@ -504,17 +289,6 @@ class SendQueue:
                 heap.clear()
             each.newest.clear()
         self._entries.clear()
-        self._idle.clear()
+        self._spare_time.clear()
         self._purge_at = PURGE_AT
         return [(message, indices) for message, indices in left if indices]
-
-
-def _turn(message: MessageSymbols, *, repeats: bool) -> Turn:
-    sharing = message.sharing
-    return Turn(message) if sharing is None else SharedTurn(message, sharing, repeats=repeats)
-
-
-def _most_symbols(message: MessageSymbols, budget: int) -> int:
-    """Return how many of its symbols leave together within a budget in bytes; at least 1."""
-    size = message.symbol + FRAGMENT_OVERHEAD_BYTES
-    return max(1, min(MAX_RUN, budget // size, MAX_RUN_BYTES // size))

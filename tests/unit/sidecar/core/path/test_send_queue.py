@@ -6,7 +6,8 @@ import pytest
 
 from plr.sidecar.core.base.timers import NEVER
 from plr.sidecar.core.base.values import SHARE, Priority
-from plr.sidecar.core.path.send_queue import MAX_RUN, MAX_RUN_BYTES, PURGE_AT, SendQueue
+from plr.sidecar.core.path.send_queue import PURGE_AT, SendQueue
+from plr.sidecar.core.path.turn import MAX_RUN, MAX_RUN_BYTES
 from plr.sidecar.core.wire.frame import FRAGMENT_OVERHEAD_BYTES
 from tests.support.builders import message
 

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 from plr.sidecar.core.message.sharing import OFFER_S
 from plr.sidecar.core.path.send_queue import SendQueue
+from plr.sidecar.core.path.turn import LOOK_AGAIN_S
 from tests.support.builders import message
 
 if TYPE_CHECKING:
@@ -79,7 +80,7 @@ def test_a_slow_path_leaves_the_end_to_a_fast_one_and_repeats_only() -> None:
     assert take(fast) == (1, 0, 1)
     assert take(slow, rtt_s=1.0) is None
     assert len(slow) == 1
-    assert slow.rests_until == OFFER_S
+    assert slow.rests_until == LOOK_AGAIN_S
     assert take(fast, MUCH) == (1, 1, outbound.count - 1)
 
 

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from plr.sidecar.core.base.timers import NEVER
-from plr.sidecar.core.path.send_queue import PATIENCE, SMALL, Turn
+from plr.sidecar.core.path.turn import PATIENCE, SMALL, Turn
 from tests.support.builders import message
 
 if TYPE_CHECKING:

@@ -1,0 +1,120 @@
+"""Keeps the shared messages of which nothing waits for this path alone: what it may repeat in spare time.
+
+Some symbols of such a message may still be untaken: other paths would deliver them sooner. Whether that is still so is
+looked at again and again.
+"""
+
+from __future__ import annotations
+
+import heapq
+from itertools import count
+from typing import TYPE_CHECKING
+
+from plr.sidecar.core.base.timers import NEVER
+from plr.sidecar.core.path.turn import SharedTurn, SymbolRun, most_symbols
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from plr.sidecar.core.path.turn import Turn
+
+
+class SpareTime:
+    """Shared messages that go after all others."""
+
+    __slots__ = ("_declined", "_entries", "_members", "_order", "_repeatable")
+
+    def __init__(self, entries: dict[int, Turn]) -> None:
+        """Create it empty. `entries`: all messages on the path; what comes to its end here is taken out of them."""
+        self._entries = entries
+        self._members: dict[int, SharedTurn] = {}
+        self._declined: list[tuple[float, int, SharedTurn]] = []
+        """Left to other paths: when to look again, order, message. Entries that were removed may remain, as below."""
+        self._repeatable: list[tuple[bool, float, int, SharedTurn]] = []
+        """Too late, deadline, order, message."""
+        self._order = count()
+
+    def add(self, entry: SharedTurn, look_at: float | None = None) -> None:
+        """Add a message; `look_at`: some of it is left to other paths, and is looked at again at this time (s)."""
+        self._members[entry.message.number] = entry
+        self._list(entry)
+        if look_at is not None:
+            heapq.heappush(self._declined, (look_at, next(self._order), entry))
+
+    def _list(self, entry: SharedTurn) -> None:
+        if not entry.listed:
+            entry.listed = True
+            heapq.heappush(self._repeatable, (False, entry.message.deadline, next(self._order), entry))
+
+    def _unlist(self) -> None:
+        heapq.heappop(self._repeatable)[-1].listed = False
+
+    def remove(self, number: int) -> bool:
+        """Remove a message if it is here; return whether it was."""
+        return self._members.pop(number, None) is not None
+
+    def due(self, now: float) -> Iterator[SharedTurn]:
+        """Remove and yield what is to be looked at again by now."""
+        declined = self._declined
+        while declined and declined[0][0] <= now:
+            entry = heapq.heappop(declined)[2]
+            if not self._is_member(entry):
+                continue
+            if entry.message.over:
+                self._end(entry)
+            elif entry.has_left:
+                self._list(entry)
+            else:
+                self.remove(entry.message.number)
+                yield entry
+
+    @property
+    def next_look(self) -> float:
+        """When to look again at what is left to other paths (s); NEVER if nothing is."""
+        return self._declined[0][0] if self._declined else NEVER
+
+    def take(self, now: float, budget: int, round_trip_s: float) -> SymbolRun | None:
+        """Return symbols that other paths carry, of the message that is most urgent and can still be in time."""
+        repeatable = self._repeatable
+        while repeatable:
+            late, deadline, order, entry = repeatable[0]
+            message = entry.message
+            if not self._is_member(entry):
+                self._unlist()
+            elif message.over or message.expires <= now:
+                self._unlist()
+                self._end(entry)
+            elif not late and deadline <= now + round_trip_s:
+                heapq.heapreplace(repeatable, (True, deadline, order, entry))
+            elif (run := entry.repeat(most_symbols(message, budget))) is not None:
+                return SymbolRun(message, *run, repeats=True)
+            else:
+                self._unlist()
+                if entry.has_left:
+                    self._end(entry)
+        return None
+
+    def _is_member(self, entry: SharedTurn) -> bool:
+        return self._members.get(entry.message.number) is entry
+
+    def _end(self, entry: SharedTurn) -> None:
+        """Take out a message of which this path sends nothing more."""
+        entry.leave()
+        self.remove(entry.message.number)
+        self._entries.pop(entry.message.number, None)
+
+    def purge(self) -> None:
+        """Forget messages that are over, and what was removed."""
+        self._members = {number: entry for number, entry in self._members.items() if not entry.message.over}
+        for item in self._repeatable:
+            item[-1].listed = self._is_member(item[-1])
+        self._declined[:] = [item for item in self._declined if self._is_member(item[-1])]
+        self._repeatable[:] = [item for item in self._repeatable if item[-1].listed]
+        heapq.heapify(self._declined)
+        heapq.heapify(self._repeatable)
+
+    def clear(self) -> None:
+        """Forget everything."""
+        self._members.clear()
+        self._declined.clear()
+        self._repeatable.clear()
