@@ -55,7 +55,6 @@ class PathKeeper:
         path.mtu.on_delivered(max(run.longest for run in arrived))
         if recovery.sample is not None:
             path.control.on_acked(recovery.sample, recovery.rtt, now)
-            path.recent.on_acked(recovery.sample.acked_bytes, now)
         path.note_rtt()
         if path.made_progress(now):
             self.path_up(path, now)

@@ -171,7 +171,7 @@ class DatagramBuilder:
                     allowance = address.allowance
                 budget = budget if allowance is None else min(budget, allowance)
             pulls = path.state is PathState.UP
-            run = queue.take(now, budget, path.expected_rate(now), recovery.rtt.smoothed, pulls=pulls)
+            run = queue.take(now, budget, control.pacing_rate or 0.0, recovery.rtt.smoothed, pulls=pulls)
             if run is None:
                 control.ran_dry()
                 break
@@ -181,15 +181,10 @@ class DatagramBuilder:
                 address.block()
                 control.ran_dry()
                 break
-            if run.repeats:
-                path.recent.paused()
-            else:
-                path.recent.on_sent(now, recovery.rtt.minimum)
             sent = self._add_run(path, remote, run, burst, now)
             control.on_sent(now, sent, recovery.in_flight)
             budget -= sent
         if not len(queue):
-            path.recent.paused()
             control.ran_dry()  # also when the last run used up the budget: nothing looks at an empty queue again
         if queue.expired != expired_before:
             self._stats.dropped["expired"] += queue.expired - expired_before

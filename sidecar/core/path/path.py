@@ -11,7 +11,6 @@ from plr.sidecar.core.path.introductions import Introductions
 from plr.sidecar.core.path.owed import Owed
 from plr.sidecar.core.path.pmtu import PathMtu
 from plr.sidecar.core.path.probing import Probing
-from plr.sidecar.core.path.recent_rate import RecentRate
 from plr.sidecar.core.path.recovery import Recovery
 from plr.sidecar.core.path.report import PathReport
 from plr.sidecar.core.path.send_queue import SendQueue
@@ -64,7 +63,6 @@ class Path:
         "probing",
         "queue",
         "received",
-        "recent",
         "recovery",
         "remote_id",
         "renewed_at",
@@ -113,7 +111,6 @@ class Path:
         self.recovery = Recovery(first_number, rng)
         self._make_control = make_control
         self.control = make_control()
-        self.recent = RecentRate()
         self.mtu = PathMtu()
         self.queue = SendQueue()
         self.introductions = Introductions()
@@ -306,11 +303,6 @@ class Path:
             self.renewed_at = None
         self.note_rtt()
         return probe.sent_at
-
-    def expected_rate(self, now: float) -> float:
-        """Return the rate (bytes a second) at which what waits will be delivered; 0 while unknown."""
-        pace, recent = self.control.pacing_rate or 0.0, self.recent.at_most(now)
-        return pace if recent is None else min(pace, recent)
 
     @property
     def next_release(self) -> float | None:
