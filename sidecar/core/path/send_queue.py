@@ -141,12 +141,13 @@ class SendQueue:
         """
         if pulls is not self._pulls:
             self._pulls, self.rests_until = pulls, 0.0
-        for entry in self._spare_time.due(now):
+        spare_time = self._spare_time
+        for entry in spare_time.due(now) if spare_time.members else ():
             until = self._left_to_others(entry, now, pace, round_trip_s)
             if until is None:
                 self._insert(entry)
             else:
-                self._spare_time.add(entry, until)
+                spare_time.add(entry, until)
         waiting = [
             each for each in self._classes if any(each.heaps) and self._head(each, now, pace, round_trip_s) is not None
         ]
@@ -162,9 +163,9 @@ class SendQueue:
                 continue
             self._note_turn(waiting, chosen, run.symbols)
             return run
-        run = self._spare_time.take(now, budget, round_trip_s)
-        if run is None and self._entries:
-            self.rests_until = self._spare_time.next_look
+        run = spare_time.take(now, budget, round_trip_s) if spare_time.members else None
+        if run is None and spare_time.members:
+            self.rests_until = spare_time.next_look
         return run
 
     def _note_turn(self, waiting: list[_Class], chosen: _Class, symbols: int) -> None:
@@ -186,21 +187,12 @@ class SendQueue:
             if run is not None:
                 entry.goes_on(now, pace, round_trip_s)
                 if entry.has_left:
-                    self._has_left(heap)
+                    self._drop(heap)
                 elif heap is not chosen.fresh and heap is not chosen.covered:
                     heapq.heapreplace(heap, (BEGUN, heap[0][1], entry))
                 return SymbolRun(message, *run)
-            self._has_left(heap)
-        return None
-
-    def _has_left(self, heap: list[_Entry]) -> None:
-        """Take out the head, of which nothing waits any more: drop it, or keep it to be repeated."""
-        entry = heap[0][2]
-        if isinstance(entry, SharedTurn):
-            heapq.heappop(heap)
-            self._spare_time.add(entry)
-        else:
             self._drop(heap)
+        return None
 
     def _head(self, each: _Class, now: float, pace: float, round_trip_s: float) -> list[_Entry] | None:
         """Return the heap whose head goes next; drop heads that are over, and move those that belong elsewhere."""
@@ -225,7 +217,11 @@ class SendQueue:
                     self._move(heap, each.useless, -message.expires)
                 elif heap is not each.fresh:
                     return heap
-                elif (until := self._left_to_others(entry, now, pace, round_trip_s)) is not None:
+                elif (
+                    until := entry.covered_until(now, pace, round_trip_s)
+                    if self._pulls
+                    else self._left_to_others(entry, now, pace, round_trip_s)
+                ) is not None:
                     entry.waits()
                     heapq.heappop(heap)
                     if isinstance(entry, SharedTurn):
@@ -279,7 +275,12 @@ class SendQueue:
         heapq.heappush(to, (BEGUN if entry.begun else by, order, entry))
 
     def _drop(self, heap: list[_Entry]) -> None:
-        del self._entries[heapq.heappop(heap)[2].message.number]
+        """Take out the head, of which nothing waits any more; keep a shared one for spare time, if it is not over."""
+        entry = heapq.heappop(heap)[2]
+        if isinstance(entry, SharedTurn) and not entry.message.over:
+            self._spare_time.add(entry)
+        else:
+            del self._entries[entry.message.number]
 
     def clear(self) -> list[tuple[MessageSymbols, tuple[int, ...]]]:
         """Empty the queue and return each message with its symbols that did not leave."""

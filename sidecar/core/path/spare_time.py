@@ -22,12 +22,13 @@ if TYPE_CHECKING:
 class SpareTime:
     """Shared messages that go after all others."""
 
-    __slots__ = ("_declined", "_entries", "_members", "_order", "_repeatable")
+    __slots__ = ("_declined", "_entries", "_order", "_repeatable", "members")
 
     def __init__(self, entries: dict[int, Turn]) -> None:
         """Create it empty. `entries`: all messages on the path; what comes to its end here is taken out of them."""
         self._entries = entries
-        self._members: dict[int, SharedTurn] = {}
+        self.members: dict[int, SharedTurn] = {}
+        """By number; do not change it."""
         self._declined: list[tuple[float, int, SharedTurn]] = []
         """Left to other paths: when to look again, order, message. Entries that were removed may remain, as below."""
         self._repeatable: list[tuple[bool, float, int, SharedTurn]] = []
@@ -36,7 +37,7 @@ class SpareTime:
 
     def add(self, entry: SharedTurn, look_at: float | None = None) -> None:
         """Add a message; `look_at`: some of it is left to other paths, and is looked at again at this time (s)."""
-        self._members[entry.message.number] = entry
+        self.members[entry.message.number] = entry
         self._list(entry)
         if look_at is not None:
             heapq.heappush(self._declined, (look_at, next(self._order), entry))
@@ -51,7 +52,7 @@ class SpareTime:
 
     def remove(self, number: int) -> bool:
         """Remove a message if it is here; return whether it was."""
-        return self._members.pop(number, None) is not None
+        return self.members.pop(number, None) is not None
 
     def due(self, now: float) -> Iterator[SharedTurn]:
         """Remove and yield what is to be looked at again by now."""
@@ -95,7 +96,7 @@ class SpareTime:
         return None
 
     def _is_member(self, entry: SharedTurn) -> bool:
-        return self._members.get(entry.message.number) is entry
+        return self.members.get(entry.message.number) is entry
 
     def _end(self, entry: SharedTurn) -> None:
         """Take out a message of which this path sends nothing more."""
@@ -105,7 +106,7 @@ class SpareTime:
 
     def purge(self) -> None:
         """Forget messages that are over, and what was removed."""
-        self._members = {number: entry for number, entry in self._members.items() if not entry.message.over}
+        self.members = {number: entry for number, entry in self.members.items() if not entry.message.over}
         for item in self._repeatable:
             item[-1].listed = self._is_member(item[-1])
         self._declined[:] = [item for item in self._declined if self._is_member(item[-1])]
@@ -115,6 +116,6 @@ class SpareTime:
 
     def clear(self) -> None:
         """Forget everything."""
-        self._members.clear()
+        self.members.clear()
         self._declined.clear()
         self._repeatable.clear()

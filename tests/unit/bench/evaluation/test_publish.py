@@ -115,7 +115,7 @@ def test_all_drives_are_shown_with_how_many_are_distinct_and_what_an_oracle_miss
     assert "All 2 windows of recorded drives, 200 requests each; only 1 of them are distinct drives" in drives
     assert "multipath TCP | 2.5 % | 2.5 % | 2.5 % | 347 ms | 100 ms | no answer |" in drives
     assert "| `plr-replicate` | 2.0 % | 2.0 % | 0.0 % |" in drives
-    assert "misses 0.5 %, 25 % of what `plr-replicate` misses" in drives
+    assert "misses 0.5 %. This is 25 % of what `plr-replicate` misses." in drives
     assert "of all 2: " in all_blocks(found)["verdicts"], (
         "the gain over all drives stands beside that over the hard ones"
     )
