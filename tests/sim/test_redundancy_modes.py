@@ -19,6 +19,14 @@ DEADLINE_S = 0.2
 SECONDS = 45.0
 RATE_HZ = 10.0
 SIZE = 3_000
+ONE_PATH_EACH = (
+    RedundancyMode.SINGLE,
+    RedundancyMode.BACKUP,
+    RedundancyMode.HEDGE,
+    RedundancyMode.ADAPTIVE,
+    RedundancyMode.REPLICATE,
+)
+"""The modes in which one path carries a whole copy, the cheapest first."""
 
 
 @dataclass(frozen=True)
@@ -89,7 +97,7 @@ def outcome(mesh: Mesh, robot: Node, before: int) -> Outcome:
 
 
 def test_each_mode_misses_less_than_the_cheaper_one() -> None:
-    single, backup, hedge, adaptive, replicate = (drive(mode).misses for mode in RedundancyMode)
+    single, backup, hedge, adaptive, replicate = (drive(mode).misses for mode in ONE_PATH_EACH)
     assert single >= 3, "there is something to avoid"
     assert single > backup >= hedge
     assert single - hedge >= 0.9 * (single - replicate)
@@ -97,7 +105,7 @@ def test_each_mode_misses_less_than_the_cheaper_one() -> None:
 
 
 def test_hedges_cost_little() -> None:
-    single, backup, hedge, adaptive, replicate = (drive(mode) for mode in RedundancyMode)
+    single, backup, hedge, adaptive, replicate = (drive(mode) for mode in ONE_PATH_EACH)
     assert single.extra <= 0.02, "exploration only"
     assert backup.extra < hedge.extra < 0.2
     assert replicate.extra == pytest.approx(1.0, abs=0.02), "beside a few sent in trouble"
