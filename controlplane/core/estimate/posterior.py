@@ -35,6 +35,9 @@ MAX_BATCH_CORRELATION = 0.9
 
 _SURE = 1e-6
 """No ratio is taken to be nearer to 0 or 1 when predictions are scored."""
+MOST_TRIALS = 1e6
+"""Requests that one report may count. A member may claim any number, and beyond 2^53 sums are no longer exact: a
+posterior without any hit left has no distribution, and planning would fail for the whole fleet."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -152,7 +155,9 @@ class FadedTrials:
         return self._at
 
     def add(self, trials: float, misses: float, now: float) -> None:
-        """Count trials, of which `misses` missed."""
+        """Count trials, of which `misses` missed; more than MOST_TRIALS at once count as so many, missing as often."""
+        if trials > MOST_TRIALS:
+            trials, misses = MOST_TRIALS, misses * MOST_TRIALS / trials
         passed_s = now - self._at
         self._at = now
         self.forget(self._silence.end())

@@ -89,3 +89,13 @@ def test_one_early_miss_does_not_condemn() -> None:
     trials, now = fed([True, False, False, False, False], half_life_s=60.0)
     prior = Estimate.of(0.01, 20.0)
     assert trials.posterior(prior, now).mean < 0.1
+
+
+@pytest.mark.parametrize("claimed", [2**53, 2**63 - 1])
+def test_a_member_that_claims_any_number_leaves_a_distribution(claimed: int) -> None:
+    """A posterior without any hit left has none, and planning failed for the whole fleet."""
+    trials = FadedTrials(60.0, 0.0)
+    for second in range(100):
+        trials.add(claimed, claimed, float(second))
+    estimate = trials.posterior(PRIOR, 100.0)
+    assert 0.0 < estimate.mean < 1.0
