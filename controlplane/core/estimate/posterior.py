@@ -35,6 +35,8 @@ MAX_BATCH_CORRELATION = 0.9
 
 _SURE = 1e-6
 """No ratio is taken to be nearer to 0 or 1 when predictions are scored."""
+LEAST_MEAN = 1e-12
+"""Least distance of a mean from 0 and 1: a distribution needs some weight on either side."""
 MOST_TRIALS = 1e6
 """Requests that one report may count. A member may claim any number, and beyond 2^53 sums are no longer exact: a
 posterior without any hit left has no distribution, and planning would fail for the whole fleet."""
@@ -59,7 +61,8 @@ class Estimate:
 
     @classmethod
     def of(cls, mean: float, weight: float) -> Estimate:
-        """Return an estimate of that mean and weight; 0 < mean < 1."""
+        """Return an estimate of that mean and weight; a mean that rounding made 0 or 1 is kept off them."""
+        mean = min(max(mean, LEAST_MEAN), 1.0 - LEAST_MEAN)
         return cls(mean * weight, (1.0 - mean) * weight)
 
 

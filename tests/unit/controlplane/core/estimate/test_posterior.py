@@ -99,3 +99,10 @@ def test_a_member_that_claims_any_number_leaves_a_distribution(claimed: int) -> 
         trials.add(claimed, claimed, float(second))
     estimate = trials.posterior(PRIOR, 100.0)
     assert 0.0 < estimate.mean < 1.0
+
+
+def test_an_estimate_has_some_weight_on_either_side() -> None:
+    for mean in (0.0, 1.0):
+        estimate = Estimate.of(mean, 1e9)
+        assert estimate.mean == pytest.approx(mean, abs=1e-9)
+        assert min(estimate.misses, estimate.hits) > 0.0
