@@ -255,6 +255,8 @@ class Dispatching:
             return None
         if any(routes.reaches(copy.path.peer) or copy.message.may_have_left for copy in waiting):
             return None
+        if not all(copy.certainly_not_run for copy in request.copies if copy.state is not CopyState.PENDING):
+            return None  # an earlier copy may have run, and its server is gone
         servers = request.worth_another_copy(self._parts.offers.servers(request.service), rejected=False)
         path = self._parts.mapping.rescue(self.with_room(servers, request))
         if path is None:

@@ -12,7 +12,7 @@ from plr.sidecar.core.base.values import PathId, PathState, RejectReason
 from plr.sidecar.core.robot.dispatch.dispatcher import MAX_COPIES_OF_REQUEST
 from plr.sidecar.core.seam.application import ResponseArrived
 from plr.sidecar.core.seam.links import Seek
-from tests.support.builders import A, B, request_id
+from tests.support.builders import WWAN, A, B, path, request_id
 from tests.unit.sidecar.core.request_table import RACE, SERVERS, WLAN_A, WWAN_B, Table
 
 if TYPE_CHECKING:
@@ -128,6 +128,23 @@ def test_when_its_server_goes_a_request_that_may_not_run_twice_fails_and_another
     table.table.on_peer_gone(A, 0.1)
     assert table.sent() == [WWAN_B]
     assert table.events == []
+
+
+def test_a_request_that_may_have_run_is_not_taken_back_although_a_later_copy_never_left() -> None:
+    table = Table(idempotent=False)
+    wwan_a = path(WWAN, A)
+    table.routes.set_state(wwan_a, PathState.UP)
+    table.submit(begun=False)
+    assert table.sent() == [WLAN_A, wwan_a]
+    request = table.parts.in_flight.get(request_id(1))
+    assert request is not None
+    request.copies[0].message.symbols.begun = True
+    for gone in (WLAN_A, wwan_a):
+        table.routes.set_state(gone, PathState.DOWN)
+    table.table.on_peer_gone(A, 0.2)
+    table.finish(0.2)
+    assert table.sent() == []
+    assert "may have run" in table.only_failure().reason
 
 
 def test_a_request_without_any_path_has_the_links_look_for_one() -> None:
