@@ -266,6 +266,7 @@ class Mesh:
         self.run(seconds)
         node.asleep = False
         node.slept_s += seconds
+        node.engine.on_woken(seconds, node.now)
         self.pump(node)
 
     def at(self, delay: float, act: Callable[[], None]) -> None:

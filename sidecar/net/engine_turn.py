@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from plr.sidecar.net.suspension import Suspension, boot_time
+
 if TYPE_CHECKING:
     import threading
     from collections.abc import Callable, Iterable
@@ -22,7 +24,7 @@ class EngineTurn:
     manager would cost every request more.
     """
 
-    __slots__ = ("_clock", "_engine", "_lock", "_queue_outputs")
+    __slots__ = ("_boot_clock", "_clock", "_engine", "_lock", "_queue_outputs", "_suspension")
 
     def __init__(
         self,
@@ -30,17 +32,31 @@ class EngineTurn:
         lock: threading.RLock,
         clock: Callable[[], float],
         queue_outputs: Callable[[], Iterable[InterfaceThread]],
+        boot_clock: Callable[[], float] = boot_time,
     ) -> None:
-        """Use `queue_outputs`, called with the lock held, which returns the links to wake."""
+        """Use `queue_outputs`, called with the lock held, which returns the links to wake.
+
+        `boot_clock` goes on while the host is suspended: the engine learns of that before anything else.
+        """
         self._engine = engine
         self._lock = lock
         self._clock = clock
         self._queue_outputs = queue_outputs
+        self._boot_clock = boot_clock
+        self._suspension = Suspension(clock(), boot_clock())
 
     def __enter__(self) -> tuple[Engine, float]:
         """Return the engine, and the time."""
         self._lock.acquire()
-        return self._engine, self._clock()
+        try:
+            now = self._clock()
+            slept_s = self._suspension.slept_s(now, self._boot_clock())
+            if slept_s:
+                self._engine.on_woken(slept_s, now)
+        except BaseException:
+            self._lock.release()
+            raise
+        return self._engine, now
 
     def __exit__(self, error: type[BaseException] | None, *_: object) -> None:
         """End the turn."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import pytest
 
 from lab.simulated.mesh import rule
+from plr.protos.model.redundancy_mode import RedundancyMode
 from plr.sidecar.core.seam.application import RequestFailed
 from tests.sim.nat import NatMesh
 from tests.sim.test_mesh import mapped
@@ -72,3 +73,29 @@ def test_a_robot_that_was_suspended_goes_on_at_once(seconds: float, rebinds: boo
     assert all((request in took) != (request in failed) for request in pending)  # none is forgotten
     assert len(took) == len(robot.responses())
     assert all(len(cloud.executed) <= 33 for cloud in clouds)
+
+
+@pytest.mark.parametrize(("lifetime_s", "sleeps"), [(10.0, [70.0]), (40.0, [30.0] * 5)])
+@pytest.mark.parametrize("mode", RedundancyMode)
+def test_a_request_does_not_run_again_at_a_server_that_forgot_it_while_the_robot_was_suspended(
+    mode: RedundancyMode, lifetime_s: float, sleeps: list[float]
+) -> None:
+    mesh = NatMesh(1)
+    robot = mesh.robot("wlan0", "wwan0", rules=(rule(lifetime_s=lifetime_s, deadline_s=0.5, redundancy=mode),))
+    cloud = mesh.cloud("cloud-a")
+    mesh.push_views()
+    mesh.run(2.0)
+    mapped(mesh, robot, ("wlan0", "cloud-a"), ("wwan0", "cloud-a"))
+    for wire in mesh.all_wires_of("robot.wlan0") + mesh.all_wires_of("robot.wwan0"):
+        wire.delay_s = 0.1
+    request = robot.submit(b"once")
+    mesh.run(0.15)
+    for seconds in sleeps:
+        mesh.suspend(robot, seconds)
+    mesh.run(lifetime_s + 1.0)
+    assert len(cloud.executed) == 1
+    answered = [answer.request_id for answer in robot.responses()]
+    failed = [event for event in robot.events if isinstance(event, RequestFailed)]
+    assert answered == []
+    assert [event.request_id for event in failed] == [request]
+    assert "suspended for" in failed[0].reason

@@ -222,6 +222,9 @@ class CloudRole:
 
     def handle_timer(self, now: float) -> None:
         """Give up what took too long to run or to be sent, as much of it as this turn has room for."""
+    def on_woken(self, slept_s: float, now: float) -> None:
+        """Do nothing: what was asked is remembered for longer."""
+
         abandoned, replies = self.executions.handle_timer(now, self._parts.backlog)
         for event in abandoned:
             self._parts.emit(event)

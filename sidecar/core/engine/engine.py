@@ -389,6 +389,11 @@ class Engine:
         timers = (self._backlog.next_timer(), self._role.next_timer())
         return min((self._sweep_at, self.revocations.next_timer(), *(timer for timer in timers if timer is not None)))
 
+    def on_woken(self, slept_s: float, now: float) -> None:
+        """Note that the host was suspended for so long (s) since the last call; `now` does not count it."""
+        self._role.on_woken(slept_s, now)
+        self._after_news(now)
+
     def handle_timer(self, now: float) -> None:
         """Do what is due now, as much of it as one turn has room for."""
         self._backlog.begin_turn(now)

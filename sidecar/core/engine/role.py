@@ -104,3 +104,6 @@ class EngineRole(Protocol):
 
     def handle_timer(self, now: float) -> None:
         """Do what is due now, as much of it as one turn has room for."""
+    def on_woken(self, slept_s: float, now: float) -> None:
+        """Follow that the host was suspended for so long (s), in which the clock stood still."""
+

@@ -73,6 +73,8 @@ class RequestTable:
         self._calling_off = CallingOff(parts.routes, parts.outbox, parts.stats)
         self._dispatching = Dispatching(parts)
         self._no_room = NoRoom(self._dispatching, parts.routes)
+        self._slept_s = 0.0
+        """How long the host was suspended in all: a monotonic clock stands still meanwhile."""
         self.unanswered = 0
         self._held_bytes = 0
 
@@ -90,6 +92,7 @@ class RequestTable:
         self._attention.ask_for(servers, now)
         size_class = self._parts.measurements.size_class(service, len(payload))
         request = Request(request_id, service, kind, rule, payload, now, size_class)
+        request.slept_before_s = self._slept_s
         request.size = request_bytes(service, kind, len(payload))
         self._requests.add(request)
         self._count_unanswered(1)
@@ -504,6 +507,19 @@ class RequestTable:
                 self._miss(request)
                 if request.rule.idempotent and request not in self._no_room:  # it does not overtake those that wait
                     self._rescue(request, now, insist=True)
+
+    def on_woken(self, slept_s: float, now: float) -> None:
+        """End the requests whose lifetime ended while the host was suspended for `slept_s`.
+
+        Their servers may have forgotten them: a further copy would run a second time.
+        """
+        self._slept_s += slept_s
+        for request in self._requests.all():
+            slept_s = self._slept_s - request.slept_before_s
+            if request.expires_at - slept_s <= now:
+                lifetime_s = request.rule.lifetime_s
+                why = f"no answer within {lifetime_s:g} s: this host was suspended for {slept_s:.0f} s"
+                self._end(request, why, now)
 
     def _miss(self, request: Request) -> None:
         request.missed = True

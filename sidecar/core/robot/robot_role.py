@@ -235,6 +235,10 @@ class RobotRole:
 
     def handle_timer(self, now: float) -> None:
         """Handle the requests' deadlines that are over, and end the offers that were dark for long."""
+    def on_woken(self, slept_s: float, now: float) -> None:
+        """End the requests whose lifetime ended while the host was suspended."""
+        self.requests.on_woken(slept_s, now)
+
         self.requests.handle_timer(now)
         dark_until = self.catalog.next_timer()
         if dark_until is not None and dark_until <= now:

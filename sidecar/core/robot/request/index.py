@@ -66,6 +66,10 @@ class RequestIndex:
             _take_out(self._by_server, copy.path.peer, (request.id, number))
         return True
 
+    def all(self) -> list[Request]:
+        """Return all requests."""
+        return list(self._by_id.values())
+
     def services(self) -> list[ServiceName]:
         """Return the services that have requests in flight."""
         return list(self._by_service)

@@ -119,6 +119,8 @@ class Request:
     """Messages of the copies that may leave the request to each other: siblings."""
     withheld: tuple[PathId, ...] = ()
     """Further paths that its mapping names, the best first: for trouble, or to explore."""
+    slept_before_s: float = 0.0
+    """How long the host had been suspended in all when it was submitted."""
     dark: tuple[InterfaceName, ...] = ()
     """Interfaces over which no path to any of its servers was up when it was submitted."""
     observed: bool = True

@@ -20,8 +20,9 @@ class Rig:
     def __init__(self) -> None:
         self.lock = threading.RLock()
         self.noted: list[tuple[str, bool]] = []
-        self.engine = cast("Engine", object())
-        self.turn = EngineTurn(self.engine, self.lock, lambda: NOW, self.queue_outputs)
+        self.engine = cast("Engine", self)
+        self.booted = 5 * NOW
+        self.turn = EngineTurn(self.engine, self.lock, lambda: NOW, self.queue_outputs, lambda: self.booted)
 
     def note(self, what: str) -> None:
         def try_lock() -> None:
@@ -37,6 +38,10 @@ class Rig:
     def queue_outputs(self) -> set[InterfaceThread]:
         self.note("queued")
         return {cast("InterfaceThread", self)}
+
+    def on_woken(self, slept_s: float, now: float) -> None:
+        assert now == NOW
+        self.note(f"slept {slept_s:g} s")
 
     def wake(self) -> None:
         self.note("woken")
@@ -76,3 +81,12 @@ def test_an_error_of_the_outputs_frees_the_lock() -> None:
         pass
     rig.note("afterwards")
     assert rig.noted == [("afterwards", False)]
+
+
+def test_the_engine_learns_first_that_the_host_was_suspended() -> None:
+    rig = Rig()
+    rig.booted += 70.0
+    for _ in range(2):
+        with rig.turn:
+            rig.note("turn")
+    assert [what for what, _ in rig.noted] == ["slept 70 s", "turn", "queued", "woken", "turn", "queued", "woken"]
