@@ -22,7 +22,6 @@ from plr.sidecar.core.base.request_id import is_race
 from plr.sidecar.core.base.slices import in_groups
 from plr.sidecar.core.base.timers import first_of
 from plr.sidecar.core.base.values import PathState, Priority, RejectReason
-from plr.sidecar.core.cloud.executions import ReplyTo
 from plr.sidecar.core.transfer.room import Lane
 from plr.sidecar.core.transfer.waiting_line import WaitingLine
 from plr.sidecar.core.wire.messages import RejectionMessage, ResponseMessage, encode_message
@@ -33,7 +32,7 @@ if TYPE_CHECKING:
     from plr.protos.model.ids import NodeName
     from plr.sidecar.core.base.slices import Backlog, Step
     from plr.sidecar.core.base.values import PathId, RequestId
-    from plr.sidecar.core.cloud.executions import Reply
+    from plr.sidecar.core.cloud.executions import Reply, ReplyTo
     from plr.sidecar.core.message.symbols import MessageSymbols
     from plr.sidecar.core.rules.service_rule import Rules
     from plr.sidecar.core.seam.stats import EngineStats
@@ -66,10 +65,10 @@ class _Answer:
     """That reply as a message. Those to other copies are equally long."""
     size: int
     """Bytes of one of these messages."""
-    waiting: dict[int, PathId] = field(default_factory=dict)
-    """Copies it was not sent to yet, and the paths they came by."""
-    sent: dict[int, PathId] = field(default_factory=dict)
-    """Copies it was sent to, and the paths they came by."""
+    waiting: dict[int, ReplyTo] = field(default_factory=dict)
+    """Copies it was not sent to yet."""
+    sent: dict[int, ReplyTo] = field(default_factory=dict)
+    """Copies it was sent to."""
     messages: list[MessageSymbols] = field(default_factory=list)
     """Messages that carry a large answer: siblings, so that overloaded paths share it."""
 
@@ -157,42 +156,45 @@ class Answers:
 
     def _send_alone(self, reply: Reply, now: float) -> bool:
         """Send a reply at once if nothing waits for its robot; return False if it has to wait or is known."""
-        path = reply.to.path
-        if path.peer in self._lines or self._known(path.peer, reply) is not None:
+        robot = reply.to.path.peer
+        if robot in self._lines or self._known(robot, reply) is not None:
             return False
         answer = self._enter(reply, now)
         if answer is None:
             return True  # counted
-        answer.waiting[reply.to.copy] = path
-        if self._outbox.has_room(path.peer, answer.size):
+        answer.waiting[reply.to.copy] = reply.to
+        if self._outbox.has_room(robot, answer.size):
             self._send(answer, reply.to.copy)
         else:
             self._line_up(answer)
         return True
 
     def _take(self, reply: Reply, now: float) -> None:
-        copy, path = reply.to.copy, reply.to.path
-        answer = self._known(path.peer, reply)
+        copy = reply.to.copy
+        answer = self._known(reply.to.path.peer, reply)
         if answer is None:
             answer = self._enter(reply, now)
             if answer is not None:
-                answer.waiting[copy] = path
+                answer.waiting[copy] = reply.to
                 self._line_up(answer)
         elif copy not in answer.waiting and copy not in answer.sent:
-            answer.waiting[copy] = path
+            answer.waiting[copy] = reply.to
             if answer.sent:
                 self._line_up_copies(answer, (copy,))
         # Otherwise that copy came twice, as another message: its answer is on its way.
 
     def _known(self, robot: NodeName, reply: Reply) -> _Answer | None:
-        """Return the answer under way that says the same or more: its bytes may be kept only here."""
+        """Return the answer under way that says the same or more: its bytes may be kept only here.
+
+        A copy that was rejected is rejected once, whatever its sender writes into it when it sends it again.
+        """
         message = reply.message
         for answer in self._of.get(robot, {}).get(message.request_id, ()):
             known = answer.reply.message
             if isinstance(known, ResponseMessage):
                 if isinstance(message, ResponseMessage) or message.reason is RejectReason.FORGOTTEN:
                     return answer
-            elif known == message:
+            elif isinstance(message, RejectionMessage) and known.copy == message.copy:
                 return answer
         return None
 
@@ -300,17 +302,16 @@ class Answers:
         """Return the copy to send a large answer to first: its path is up and has the least to carry."""
 
         def load(copy: int) -> tuple[bool, int]:
-            path = answer.waiting[copy]
+            path = answer.waiting[copy].path
             return self._routes.state(path) is not PathState.UP, self._outbox.sent_over(path)
 
         return min(answer.waiting, key=load) if answer.lane is Lane.LARGE else next(iter(answer.waiting))
 
     def _send(self, answer: _Answer, copy: int) -> None:
         reply = answer.reply
-        path = answer.sent[copy] = answer.waiting.pop(copy)
+        to = answer.sent[copy] = answer.waiting.pop(copy)
         self._forget_got(answer)
-        if self._routes.state(path) is PathState.DOWN:
-            path = self._routes.best_to(path.peer) or path
+        path, *others = self._carriers(to, answer.request_id)
         rule = self._rules.find(reply.service)
         message = reply.message
         self._outbox.send(
@@ -322,7 +323,20 @@ class Answers:
             fec=rule.fec if rule else None,
             answers=answer.request_id,
             siblings=answer.messages if answer.lane is Lane.LARGE and not is_race(answer.request_id) else None,
+            shared_by=others,
+            repeats=1.0,
         )
+
+    def _carriers(self, to: ReplyTo, request_id: RequestId) -> list[PathId]:
+        """Return the paths that carry an answer together: those by which its request came, as far as they are up.
+
+        A race measures each path alone.
+        """
+        state, beside = self._routes.state, () if is_race(request_id) else to.beside
+        carriers = [path for path in (to.path, *beside) if state(path) is PathState.UP]
+        if not carriers and state(to.path) is PathState.DOWN:
+            return [self._routes.best_to(to.path.peer) or to.path]
+        return carriers or [to.path]
 
     def _line_up(self, answer: _Answer) -> None:
         line = self._lines_of(answer).firsts
@@ -422,6 +436,6 @@ class Answers:
     def _refusals(self, answer: _Answer) -> list[Reply]:
         refusal = self._refusal(answer, "no part of it could be sent before its time was nearly over")
         return [
-            replace(refusal, to=ReplyTo(path, copy), message=replace(refusal.message, copy=copy))
-            for copy, path in {**answer.sent, **answer.waiting}.items()
+            replace(refusal, to=to, message=replace(refusal.message, copy=copy))
+            for copy, to in {**answer.sent, **answer.waiting}.items()
         ]

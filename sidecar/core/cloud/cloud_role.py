@@ -107,24 +107,26 @@ class CloudRole:
 
     # -- the robots -----------------------------------------------------------------------------------------------
 
-    def on_message(self, path: PathId, message: ServiceMessage, ends_at: float, now: float) -> None:
-        """Take a robot's message, which is of use until `ends_at` (s)."""
+    def on_message(
+        self, path: PathId, message: ServiceMessage, ends_at: float, now: float, *, beside: tuple[PathId, ...] = ()
+    ) -> None:
+        """Take a robot's message, which is of use until `ends_at` (s); some of it came by the paths `beside`."""
         if isinstance(message, RequestMessage):
-            self._on_request(path, message.when_left(ends_at - now), now)
+            self._on_request(ReplyTo(path, message.copy, beside), message.when_left(ends_at - now), now)
         elif isinstance(message, CancelMessage):
             self._on_cancel(path.peer, message.request_id, now)
         else:
             self._parts.stats.dropped["response_to_a_cloud"] += 1
 
-    def _on_request(self, path: PathId, message: RequestMessage, now: float) -> None:
-        refusal = self._refusal(path.peer, message, now)
-        if refusal and not self.executions.knows(path.peer, message.request_id):
-            reply_to = ReplyTo(path, message.copy)
+    def _on_request(self, reply_to: ReplyTo, message: RequestMessage, now: float) -> None:
+        robot = reply_to.path.peer
+        refusal = self._refusal(robot, message, now)
+        if refusal and not self.executions.knows(robot, message.request_id):
             self.answers.send([self.executions.refuse_unseen(reply_to, message, *refusal, now)], now)
             return
         rule = self._parts.rules.find(message.service)
         patience_s = rule.lifetime_s if rule else MAX_LIFETIME_S
-        outcome = self.executions.on_request(path, message, now, patience_s=patience_s)
+        outcome = self.executions.on_request(reply_to.path, message, now, patience_s=patience_s, beside=reply_to.beside)
         if isinstance(outcome, ExecuteRequest):
             self._parts.emit(outcome)
         elif isinstance(outcome, Reply):
@@ -220,11 +222,11 @@ class CloudRole:
         timers = (self.executions.next_timer(), self.answers.next_timer())
         return min((timer for timer in timers if timer is not None), default=None)
 
-    def handle_timer(self, now: float) -> None:
-        """Give up what took too long to run or to be sent, as much of it as this turn has room for."""
     def on_woken(self, slept_s: float, now: float) -> None:
         """Do nothing: what was asked is remembered for longer."""
 
+    def handle_timer(self, now: float) -> None:
+        """Give up what took too long to run or to be sent, as much of it as this turn has room for."""
         abandoned, replies = self.executions.handle_timer(now, self._parts.backlog)
         for event in abandoned:
             self._parts.emit(event)

@@ -71,6 +71,8 @@ class ReplyTo:
 
     path: PathId
     copy: int
+    beside: tuple[PathId, ...] = field(default=(), compare=False)
+    """Further paths by which some of it came: they may carry the answer as well."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -163,7 +165,13 @@ class ExecutionTable:
         return self._by_request.get(key) or self._finished.get(key)
 
     def on_request(
-        self, path: PathId, message: RequestMessage, now: float, *, patience_s: float = MAX_LIFETIME_S
+        self,
+        path: PathId,
+        message: RequestMessage,
+        now: float,
+        *,
+        patience_s: float = MAX_LIFETIME_S,
+        beside: tuple[PathId, ...] = (),
     ) -> ExecuteRequest | Reply | None:
         """Take one copy: run the request, answer from the cache, refuse, or (None) let it wait for the result.
 
@@ -171,7 +179,7 @@ class ExecutionTable:
 
         The local server may take as long as the robot waits, but at most `patience_s`.
         """
-        reply_to = ReplyTo(path, message.copy)
+        reply_to = ReplyTo(path, message.copy, beside)
         key = _Key(path.peer, message.request_id)
         running = self._by_request.get(key)
         execution = running or self._finished.get(key)

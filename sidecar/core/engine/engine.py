@@ -41,7 +41,7 @@ from plr.sidecar.core.seam.links import (
 )
 from plr.sidecar.core.seam.stats import EngineStats
 from plr.sidecar.core.transfer.engine_parts import EngineParts
-from plr.sidecar.core.transfer.inbound import Inbound
+from plr.sidecar.core.transfer.inbound import Arrived, Inbound
 from plr.sidecar.core.transfer.outbox import Outbox
 from plr.sidecar.core.transfer.routes import Routes
 from plr.sidecar.core.wire.messages import RevocationMessage, decode_message
@@ -253,8 +253,8 @@ class Engine:
                 if self.peers.session(path.peer) != session:
                     self.stats.dropped["fragment_of_old_session"] += 1
                 else:
-                    for content, ends_at in self._inbound.add(path, session, fragments, now):
-                        self._on_message(path, content, ends_at, now)
+                    for arrived in self._inbound.add(path, session, fragments, now):
+                        self._on_message(path, arrived, now)
             case MessageAbandoned(peer, session, number):
                 if self.peers.session(peer) == session:
                     self._inbound.abandon(peer, number)
@@ -299,7 +299,7 @@ class Engine:
         """Take a message whose decoding is complete (`decoding.run_slice` says when)."""
         arrived = self._inbound.take_decoded(decoding)
         if arrived is not None:
-            self._on_message(decoding.path, *arrived, now)
+            self._on_message(decoding.path, arrived, now)
             self._after_news(now)
 
     def on_decoding_failed(self, decoding: Decoding) -> None:
@@ -312,9 +312,9 @@ class Engine:
             self._role.on_room(now)
             self.revocations.on_room(now)
 
-    def _on_message(self, path: PathId, content: memoryview, ends_at: float, now: float) -> None:
+    def _on_message(self, path: PathId, arrived: Arrived, now: float) -> None:
         try:
-            message = decode_message(content)
+            message = decode_message(arrived.content)
         except UnknownKindError:
             self.stats.dropped["unknown_message"] += 1
             return
@@ -324,7 +324,7 @@ class Engine:
         if isinstance(message, RevocationMessage):
             self.revocations.on_message(path.peer, message, now)
         else:
-            self._role.on_message(path, message, ends_at, now)
+            self._role.on_message(path, message, arrived.ends_at, now, beside=arrived.beside)
 
     def _on_path_changed(self, event: PathChanged, now: float) -> None:
         path, state = event.path, event.state

@@ -59,8 +59,10 @@ class EngineRole(Protocol):
 
     # -- the peers ------------------------------------------------------------------------------------------------
 
-    def on_message(self, path: PathId, message: ServiceMessage, ends_at: float, now: float) -> None:
-        """Take a peer's message, which is of use until `ends_at` (s)."""
+    def on_message(
+        self, path: PathId, message: ServiceMessage, ends_at: float, now: float, *, beside: tuple[PathId, ...] = ()
+    ) -> None:
+        """Take a peer's message, which is of use until `ends_at` (s); some of it came by the paths `beside`."""
 
     def on_room(self, now: float) -> None:
         """Send what waits for room, since less is under way than before."""
@@ -102,8 +104,8 @@ class EngineRole(Protocol):
     def next_timer(self) -> float | None:
         """Return when to call `handle_timer`."""
 
-    def handle_timer(self, now: float) -> None:
-        """Do what is due now, as much of it as one turn has room for."""
     def on_woken(self, slept_s: float, now: float) -> None:
         """Follow that the host was suspended for so long (s), in which the clock stood still."""
 
+    def handle_timer(self, now: float) -> None:
+        """Do what is due now, as much of it as one turn has room for."""

@@ -116,7 +116,7 @@ class Link:
         """Carry out a command of the engine."""
         match command:
             case Send(path_id, message):
-                path = self._live_path(path_id, message, range(len(message)))
+                path = self._live_path(path_id, message, range(len(message)) if message.sharing is None else ())
                 if path is not None:
                     path.queue.add(message)
             case Resend(path_id, message, indices):
@@ -285,7 +285,8 @@ class Link:
     def _live_path(self, path_id: PathId, message: MessageSymbols, indices: Iterable[int]) -> Path | None:
         """Return the path if it can carry the message; otherwise hand the symbols back as lost.
 
-        The engine may have an old state of the path: it is told again, so that it does not send them here once more.
+        What several paths carry together is lost only if none of them can: the engine looks. It may have an old state
+        of the path, and is told again, so that it does not send them here once more.
         """
         path = self._paths.get((path_id.peer, path_id.remote))
         if path is None or path.state is PathState.DOWN:

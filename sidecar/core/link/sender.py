@@ -170,8 +170,10 @@ class DatagramBuilder:
                     self._add_control(path, path.take_control(now), burst, now)
                     allowance = address.allowance
                 budget = budget if allowance is None else min(budget, allowance)
-            pulls = path.state is PathState.UP
-            run = queue.take(now, budget, control.pacing_rate or 0.0, recovery.rtt.smoothed, pulls=pulls)
+            pulls, pace = path.state is PathState.UP, control.pacing_rate
+            # Repeats must not stand in a queue, where what is needed would wait behind them.
+            repeats = pace is None or recovery.in_flight < pace * recovery.rtt.minimum
+            run = queue.take(now, budget, pace or 0.0, recovery.rtt.smoothed, pulls=pulls, repeats=repeats)
             if run is None:
                 control.ran_dry()
                 break

@@ -22,6 +22,7 @@ class OutboundMessage:
         "_lost",
         "_lost_repairs",
         "answers",
+        "carriers",
         "copy_of",
         "generation",
         "interfaces",
@@ -40,12 +41,15 @@ class OutboundMessage:
         answers: RequestId | None = None,
         copy_of: RequestId | None = None,
         generation: int = 0,
+        shared_by: Iterable[PathId] = (),
     ) -> None:
         self.path = path
         """The path it was first sent over."""
+        self.carriers = (path, *shared_by)
+        """The paths that carry it together, or the one that it was first sent over."""
         self.symbols = symbols
         self.number = symbols.number
-        self.interfaces = {path.interface}
+        self.interfaces = {carrier.interface for carrier in self.carriers}
         """The interfaces it was sent over."""
         self.answers = answers
         """The request that it answers."""
@@ -95,11 +99,16 @@ class OutboundMessage:
         """Let nothing of it travel any more."""
         self.symbols.over = True
 
-    def cut_again(self, number: int, path: PathId, symbol: int) -> OutboundMessage:
+    def cut_again(self, number: int, path: PathId, symbol: int, shared_by: Iterable[PathId] = ()) -> OutboundMessage:
         """Return the same bytes as another message, for paths that carry at most `symbol` bytes at once."""
         symbols = self.symbols.cut_again(number, symbol)
         self.successor = OutboundMessage(
-            path, symbols, answers=self.answers, copy_of=self.copy_of, generation=self.generation + 1
+            path,
+            symbols,
+            answers=self.answers,
+            copy_of=self.copy_of,
+            generation=self.generation + 1,
+            shared_by=shared_by,
         )
         return self.successor
 

@@ -12,6 +12,8 @@ from plr.sidecar.core.wire.frame import symbol_count
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
+    from plr.sidecar.core.base.values import PathId
+
 LAZY_BYTES = 1024 * 1024
 """From this size on, a buffer's pages are claimed as they are written: announcing 16 MiB must cost nothing."""
 
@@ -36,6 +38,7 @@ class Partial:
         "have",
         "missing",
         "number",
+        "paths",
         "repairs",
         "symbol",
         "total",
@@ -52,6 +55,8 @@ class Partial:
         self.have = bytearray(self.count)
         """1 for each source symbol that came."""
         self.buffer = _claim(total)
+        self.paths: list[PathId] = []
+        """The paths by which its symbols came."""
         self.repairs = 0
         """Number of repair symbols stored."""
         self.touched_at = now

@@ -15,8 +15,10 @@ from plr.sidecar.core.message.partial import Partial
 
 if TYPE_CHECKING:
     from collections import Counter
+    from collections.abc import Sequence
 
     from plr.protos.model.ids import NodeName
+    from plr.sidecar.core.base.values import PathId
     from plr.sidecar.core.wire.frame import Fragment
 
 MAX_PEER_BYTES = 64 * 1024 * 1024
@@ -49,6 +51,8 @@ class Reassembled(NamedTuple):
     """The message, if it was just finished; a Partial still has to be decoded."""
     ends_at: float = NEVER
     """When a message that was just finished stops being of use."""
+    paths: Sequence[PathId] = ()
+    """The paths by which the symbols of such a message came, if they were several."""
 
 
 class Reassembler:
@@ -73,8 +77,8 @@ class Reassembler:
         """Return the number of unfinished messages."""
         return len(self._partials)
 
-    def add(self, fragments: list[Fragment], now: float) -> list[Reassembled]:
-        """Store symbols; return what there is to tell.
+    def add(self, fragments: list[Fragment], now: float, path: PathId | None = None) -> list[Reassembled]:
+        """Store symbols, which came by `path`; return what there is to tell.
 
         Each symbol is copied once, to its place in the message: nothing that is returned views a datagram.
         """
@@ -93,6 +97,8 @@ class Reassembler:
                 else:
                     partial.touched_at = now
                     partials.move_to_end(number)
+                if path is not None and path not in partial.paths:
+                    partial.paths.append(path)
             if total != partial.total or symbol != partial.symbol:
                 self._dropped["fragment_mismatch"] += 1
                 continue
@@ -161,7 +167,7 @@ class Reassembler:
     def _finish(self, partial: Partial, content: memoryview | Partial) -> Reassembled:
         self._remove(partial)
         self._remember(partial.number, Fate.FINISHED)
-        return Reassembled(partial.number, Fate.FINISHED, content, partial.ends_at)
+        return Reassembled(partial.number, Fate.FINISHED, content, partial.ends_at, partial.paths)
 
     def _make_room(self, size: int, messages: int) -> None:
         partials = self._partials

@@ -6,9 +6,11 @@ symbol alone that would arrive sooner over the others. When no symbol is left to
 do repeats symbols that others still carry, the newest first: redundancy is what spare capacity is used for, and it ends
 by itself under load.
 
-Links on several threads share this without a lock. They only take from a deque, which is atomic in CPython, and each
-writes its own offer. Whoever reads an old offer leaves a symbol alone, or takes one, that another path would have
-carried a little sooner.
+A symbol that got lost is untaken again.
+
+Links on several threads share this without a lock. They take from a deque, which is atomic in CPython, the engine gives
+back to it, and each link writes its own offer. Whoever reads an old offer leaves a symbol alone, or takes one, that
+another path would have carried a little sooner.
 """
 
 from __future__ import annotations
@@ -35,11 +37,13 @@ class Offer(NamedTuple):
 class Sharing:
     """What the paths that carry one message together know of each other."""
 
-    __slots__ = ("_offers", "_untaken", "repeats")
+    __slots__ = ("_offers", "_untaken", "_waits", "repeats")
 
     def __init__(self, symbols: int, repeats: int) -> None:
         """Begin with all `symbols` untaken; at most about `repeats` of them are carried by more than one path."""
         self._untaken = deque(range(symbols))
+        self._waits = bytearray(b"\1" * symbols)
+        """For each symbol, whether it is untaken."""
         self._offers: dict[object, Offer | None] = {}
         self.repeats = repeats
         """Symbols that may still be repeated."""
@@ -60,23 +64,30 @@ class Sharing:
 
     def take(self, most: int, needs: Callable[[int], bool]) -> tuple[int, int] | None:
         """Remove and return the next consecutive symbols as (first, count), at most `most`; None if none is left."""
-        untaken = self._untaken
+        untaken, waits = self._untaken, self._waits
         run: tuple[int, int] | None = None
         while run is None or run[1] < most:
             try:
                 index = untaken.popleft()
             except IndexError:
                 break
-            if not needs(index):
-                continue
-            if run is None:
-                run = index, 1
-            elif index == run[0] + run[1]:
-                run = run[0], run[1] + 1
-            else:
-                untaken.appendleft(index)
-                break
+            if needs(index):
+                if run is None:
+                    run = index, 1
+                elif index == run[0] + run[1]:
+                    run = run[0], run[1] + 1
+                else:
+                    untaken.appendleft(index)
+                    break
+            waits[index] = 0
         return run
+
+    def give_back(self, indices: Iterable[int]) -> None:
+        """Let these symbols, which got lost, be taken again before all others."""
+        again = [index for index in indices if not self._waits[index]]
+        for index in again:
+            self._waits[index] = 1
+        self._untaken.extendleft(reversed(again))
 
     def take_all(self) -> tuple[int, ...]:
         """Remove and return all symbols that no path has taken."""
@@ -87,6 +98,7 @@ class Sharing:
                 taken.append(untaken.popleft())
             except IndexError:
                 break
+            self._waits[taken[-1]] = 0
         return tuple(taken)
 
     def offer(self, path: object, pace: float, round_trip_s: float, now: float) -> None:

@@ -13,8 +13,9 @@ says when it expects the answer. Until that is overdue, the other paths send oth
 one carrier cannot bear the load, carriers share it instead of all sending the same symbols; elsewhere all copies leave
 at once. Copies of small requests always do.
 
-One message may also be carried by several paths together (`message/sharing.py`). When nothing else waits, this path
-repeats what the others carry of such messages.
+One message may also be carried by several paths together (`message/sharing.py`). When nothing else waits that can be in
+time, this path repeats what the others carry of such messages: first of those that can be in time, and after all that
+waits of the others.
 """
 
 from __future__ import annotations
@@ -96,7 +97,10 @@ class SendQueue:
             self._insert(turn_of(message, repeats=True))
 
     def resend(self, message: MessageSymbols, indices: Iterable[int]) -> None:
-        """Queue these symbols of a message again, before its others."""
+        """Queue these symbols of a message again, before its others.
+
+        Without any, look again at what is untaken of a message that several paths carry together.
+        """
         entry = self._entries.get(message.number)
         if entry is None:
             entry = turn_of(message, repeats=False)
@@ -131,13 +135,20 @@ class SendQueue:
         self._purge_at = max(PURGE_AT, 2 * len(self._entries))
 
     def take(
-        self, now: float, budget: int, pace: float = 0.0, round_trip_s: float = 0.0, *, pulls: bool = True
+        self,
+        now: float,
+        budget: int,
+        pace: float = 0.0,
+        round_trip_s: float = 0.0,
+        *,
+        pulls: bool = True,
+        repeats: bool = True,
     ) -> SymbolRun | None:
         """Remove and return what leaves next: at most about `budget` bytes, but at least one symbol.
 
         Messages that are over or expired are dropped on the way. `pace` (bytes a second, 0 when unknown) and
         `round_trip_s` tell which can still make their deadline. `pulls`: the path is up, and may take what others could
-        carry as well.
+        carry as well. `repeats`: it has capacity to spare, and may repeat what others carry.
         """
         if pulls is not self._pulls:
             self._pulls, self.rests_until = pulls, 0.0
@@ -151,6 +162,11 @@ class SendQueue:
         waiting = [
             each for each in self._classes if any(each.heaps) and self._head(each, now, pace, round_trip_s) is not None
         ]
+        may_repeat = repeats and bool(spare_time.members)
+        if may_repeat and not any(each.fresh for each in waiting):
+            run = spare_time.take(now, budget, round_trip_s, late=False)
+            if run is not None:
+                return run
         while waiting:
             chosen, most = waiting[0], MAX_RUN
             for lower in reversed(waiting[1:]):
@@ -163,7 +179,7 @@ class SendQueue:
                 continue
             self._note_turn(waiting, chosen, run.symbols)
             return run
-        run = spare_time.take(now, budget, round_trip_s) if spare_time.members else None
+        run = spare_time.take(now, budget, round_trip_s) if may_repeat else None
         if run is None and spare_time.members:
             self.rests_until = spare_time.next_look
         return run
@@ -283,7 +299,10 @@ class SendQueue:
             del self._entries[entry.message.number]
 
     def clear(self) -> list[tuple[MessageSymbols, tuple[int, ...]]]:
-        """Empty the queue and return each message with its symbols that did not leave."""
+        """Empty the queue and return each message with its symbols that did not leave and no other path would carry.
+
+        Of a message that several paths carry together there may be none.
+        """
         left = [(entry.message, entry.leave()) for entry in self._entries.values()]
         for each in self._classes:
             for heap in each.heaps:
@@ -292,4 +311,8 @@ class SendQueue:
         self._entries.clear()
         self._spare_time.clear()
         self._purge_at = PURGE_AT
-        return [(message, indices) for message, indices in left if indices]
+        return [(message, indices) for message, indices in left if indices or _is_shared(message)]
+
+
+def _is_shared(message: MessageSymbols) -> bool:
+    return message.sharing is not None and not message.over

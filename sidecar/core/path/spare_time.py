@@ -74,19 +74,24 @@ class SpareTime:
         """When to look again at what is left to other paths (s); NEVER if nothing is."""
         return self._declined[0][0] if self._declined else NEVER
 
-    def take(self, now: float, budget: int, round_trip_s: float) -> SymbolRun | None:
-        """Return symbols that other paths carry, of the message that is most urgent and can still be in time."""
+    def take(self, now: float, budget: int, round_trip_s: float, *, late: bool = True) -> SymbolRun | None:
+        """Return symbols that other paths carry, of the message that is most urgent and can still be in time.
+
+        `late`: if there is none, return those of a message that is too late.
+        """
         repeatable = self._repeatable
         while repeatable:
-            late, deadline, order, entry = repeatable[0]
+            is_late, deadline, order, entry = repeatable[0]
             message = entry.message
             if not self._is_member(entry):
                 self._unlist()
             elif message.over or message.expires <= now:
                 self._unlist()
                 self._end(entry)
-            elif not late and deadline <= now + round_trip_s:
+            elif not is_late and deadline <= now + round_trip_s:
                 heapq.heapreplace(repeatable, (True, deadline, order, entry))
+            elif is_late and not late:
+                return None
             elif (run := entry.repeat(most_symbols(message, budget))) is not None:
                 return SymbolRun(message, *run, repeats=True)
             else:

@@ -138,7 +138,9 @@ class RobotRole:
 
     # -- the servers ----------------------------------------------------------------------------------------------
 
-    def on_message(self, path: PathId, message: ServiceMessage, _ends_at: float, now: float) -> None:
+    def on_message(
+        self, path: PathId, message: ServiceMessage, _ends_at: float, now: float, *, beside: tuple[PathId, ...] = ()
+    ) -> None:
         """Take a server's message."""
         if isinstance(message, ResponseMessage):
             self.requests.on_response(path.peer, message, now)
@@ -233,12 +235,12 @@ class RobotRole:
         timers = (self.requests.next_timer(), self.catalog.next_timer())
         return min((timer for timer in timers if timer is not None), default=None)
 
-    def handle_timer(self, now: float) -> None:
-        """Handle the requests' deadlines that are over, and end the offers that were dark for long."""
     def on_woken(self, slept_s: float, now: float) -> None:
         """End the requests whose lifetime ended while the host was suspended."""
         self.requests.on_woken(slept_s, now)
 
+    def handle_timer(self, now: float) -> None:
+        """Handle the requests' deadlines that are over, and end the offers that were dark for long."""
         self.requests.handle_timer(now)
         dark_until = self.catalog.next_timer()
         if dark_until is not None and dark_until <= now:

@@ -11,7 +11,7 @@ from plr.sidecar.core.seam.links import SendFinished, SendForgotten
 from plr.sidecar.core.wire.frame import BASE_SYMBOL_BYTES
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Sequence
 
     from plr.protos.model.ids import NodeName, SessionId
     from plr.sidecar.core.base.values import PathId
@@ -25,6 +25,8 @@ class Arrived(NamedTuple):
 
     content: memoryview
     ends_at: float
+    beside: tuple[PathId, ...] = ()
+    """Further paths by which some of it came."""
 
 
 class Inbound:
@@ -46,7 +48,7 @@ class Inbound:
         if reassembler is None:
             reassembler = self._reassemblers[path.peer] = Reassembler(path.peer, self._stats.dropped)
         whole: list[Arrived] = []
-        for number, fate, content, ends_at in reassembler.add(fragments, now):
+        for number, fate, content, ends_at, paths in reassembler.add(fragments, now, path):
             if fate is Fate.FORGOTTEN:
                 self._command(SendForgotten(path, number))
                 continue
@@ -61,7 +63,7 @@ class Inbound:
             if isinstance(content, Partial):
                 self._line.add(Decoding(path, session, content))
             elif content is not None:
-                whole.append(Arrived(content, ends_at))
+                whole.append(Arrived(content, ends_at, _beside(path, paths)))
         return whole
 
     def on_finished_lost(self, peer: NodeName, numbers: tuple[int, ...], best: PathId | None) -> None:
@@ -102,7 +104,8 @@ class Inbound:
         """Return a computed message, unless its session is over."""
         if not self._line.done(decoding):
             return None
-        return Arrived(decoding.partial.whole(), decoding.partial.ends_at)
+        partial = decoding.partial
+        return Arrived(partial.whole(), partial.ends_at, _beside(decoding.path, partial.paths))
 
     def abandon(self, peer: NodeName, number: int) -> None:
         """Drop this message: the peer does not send the rest."""
@@ -120,6 +123,10 @@ class Inbound:
         """Drop messages that wait too long."""
         for reassembler in self._reassemblers.values():
             reassembler.expire(now)
+
+
+def _beside(path: PathId, paths: Sequence[PathId]) -> tuple[PathId, ...]:
+    return tuple(other for other in paths if other != path) if len(paths) > 1 else ()
 
 
 def _is_small(content: memoryview | Partial | None) -> bool:

@@ -7,6 +7,7 @@ from itertools import islice
 from typing import TYPE_CHECKING
 
 from plr.sidecar.core.base.slices import in_groups
+from plr.sidecar.core.base.values import PathState
 from plr.sidecar.core.message.outbound import OutboundMessage
 from plr.sidecar.core.message.repair import repair_symbols, worth_a_copy
 from plr.sidecar.core.message.symbols import MessageSymbols
@@ -21,6 +22,7 @@ if TYPE_CHECKING:
     from plr.sidecar.core.base.slices import Step
     from plr.sidecar.core.base.values import PathId, Priority, RequestId
     from plr.sidecar.core.message.repair import Loss, Redundancy
+    from plr.sidecar.core.message.sharing import Sharing
     from plr.sidecar.core.seam.links import PathCommand
     from plr.sidecar.core.seam.stats import EngineStats
     from plr.sidecar.core.transfer.routes import Routes
@@ -141,11 +143,8 @@ class Outbox:
             siblings=siblings,
             repeats=repeats if shared_by else None,
         )
-        message = OutboundMessage(path, symbols, answers=answers, copy_of=copy_of)
+        message = OutboundMessage(path, symbols, answers=answers, copy_of=copy_of, shared_by=shared_by)
         self._enter(message, loss)
-        for other in shared_by:
-            message.interfaces.add(other.interface)
-            self._command(Send(other, symbols))
         return message
 
     def _take_number(self) -> int:
@@ -160,8 +159,9 @@ class Outbox:
         if message.answers is not None:
             self._answers.setdefault((peer, message.answers), []).append(message)
         self._room.take(message)
-        self._command(Send(message.path, message.symbols))
         symbols = message.symbols
+        for path in message.carriers:
+            self._command(Send(path, symbols))
         if not symbols.repairs and symbols.sharing is None and worth_a_copy(1, loss):
             # It leaves before the others, so a burst does not take both.
             self._send_copies(message, message.path, (symbols.count - 1,))
@@ -247,6 +247,8 @@ class Outbox:
             self.drop(message)
             return
         indices = message.lost(event.indices)
+        if message.symbols.sharing is not None:
+            indices = self._give_back(message, message.symbols.sharing, indices)
         if not indices:
             return
         path = self._routes.best_to(
@@ -256,6 +258,21 @@ class Outbox:
             self._parked.setdefault(message.peer, {})[message.number] = message
         else:
             self._resend(message, path, indices)
+
+    def _give_back(self, message: OutboundMessage, sharing: Sharing, lost: tuple[int, ...]) -> tuple[int, ...]:
+        """Let the paths that carry a message together take what got lost; return what none of them can."""
+        size = message.symbols.datagram_bytes
+        carriers = [path for path in message.carriers if self._routes.max_datagram(path) >= size]
+        states = {path: self._routes.state(path) for path in carriers}
+        if PathState.UP in states.values():
+            sharing.give_back(lost)
+            for path, state in states.items():
+                if state is PathState.UP:
+                    self._command(Resend(path, message.symbols, ()))
+            return ()
+        if PathState.UNSTABLE in states.values():
+            return lost  # what is untaken waits until one of them is up again
+        return tuple(sorted({*lost, *sharing.take_all()}))
 
     def _resend(self, message: OutboundMessage, path: PathId, indices: tuple[int, ...]) -> None:
         if message.symbols.datagram_bytes > self._routes.max_datagram(path):
@@ -277,7 +294,9 @@ class Outbox:
         self._enter_again(message, path)
 
     def _enter_again(self, message: OutboundMessage, path: PathId) -> None:
-        again = message.cut_again(self._take_number(), path, self._routes.symbol_to(path.peer))
+        symbol = self._routes.symbol_to(path.peer)
+        others = [other for other in message.carriers if other != path and self._routes.state(other) is PathState.UP]
+        again = message.cut_again(self._take_number(), path, symbol, others)
         self._enter(again, self._routes.loss(path))
 
     def on_path_up(self, path: PathId) -> list[Step]:

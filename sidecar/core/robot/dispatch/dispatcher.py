@@ -26,6 +26,9 @@ if TYPE_CHECKING:
     from plr.sidecar.core.base.values import PathId
     from plr.sidecar.core.robot.dispatch.context import RequestParts
 
+SMALL_REQUEST_BYTES = 12_000
+"""Requests of up to so many bytes (about ten datagrams) go over each mapped pair whole although their mode shares: they
+hardly take capacity from others."""
 MAX_COPIES_OF_REQUEST = 8
 """Most copies of one request, including those sent in trouble."""
 MAX_COPIES_WHILE_REFUSED = 16
@@ -80,7 +83,7 @@ class Dispatching:
         servers = self._favoured(servers, now)
         chosen = self._parts.mapping.choose(request.service, servers, idempotent=rule.idempotent)
         mode = MODES[rule.redundancy]
-        if mode.shares is not None and not request.races and self._share(request, servers, chosen, mode.shares, now):
+        if self._share(request, servers, chosen, now):
             pass
         elif mode.at_once:
             self._send_all(request, self._best_first(request, chosen, now) if self._budgets.limit else chosen, now)
@@ -119,15 +122,14 @@ class Dispatching:
         if request.copies:
             MODES[request.rule.redundancy].begun(self, request, now)
 
-    def _share(
-        self,
-        request: Request,
-        servers: Collection[NodeName],
-        chosen: Collection[PathId],
-        repeats: float,
-        now: float,
-    ) -> bool:
-        """Send one copy to one of the servers over all interfaces of the chosen paths; return False if none is up."""
+    def _share(self, request: Request, servers: Collection[NodeName], chosen: Collection[PathId], now: float) -> bool:
+        """Send one copy to one of the servers over all interfaces of the chosen paths.
+
+        Return False if none of them is up, or such a request is not to be shared.
+        """
+        repeats = MODES[request.rule.redundancy].shares
+        if repeats is None or request.races or request.size <= SMALL_REQUEST_BYTES:
+            return False
         server = self._favourite(request.service, servers, chosen)
         if server is None:
             return False

@@ -20,6 +20,7 @@ from plr.sidecar.core.transfer.room import SMALL_ROOM_BYTES
 from plr.sidecar.core.transfer.routes import Routes
 from plr.sidecar.core.wire.messages import RejectionMessage, ResponseMessage, decode_message
 from tests.support.builders import ECHO, path, request_id, rule
+from tests.unit.sidecar.core.request_table import RACE
 
 if TYPE_CHECKING:
     from plr.sidecar.core.base.values import PathId
@@ -221,3 +222,39 @@ def test_an_answer_that_has_room_waits_for_no_backlog() -> None:
     cloud.backlog.add_steps([lambda _: None] * 100, 0.0)
     cloud.answer(1, 1300)
     assert cloud.sent() == [(1, 0, WLAN)]
+
+
+def reply(number: int, copy: int, *ways: PathId, size: int = 30_000) -> Reply:
+    response = ResponseMessage(request_id(number), copy, 0.01, bytes(size))
+    return Reply(ReplyTo(ways[0], copy, ways[1:]), ECHO, response, Priority.NORMAL, 5.0, 10.0)
+
+
+def test_the_paths_by_which_a_request_came_carry_its_answer_together() -> None:
+    cloud = Cloud()
+    cloud.answers.send([reply(1, 0, WWAN, WLAN)], 0.0)
+    sends = [command for command in cloud.commands if isinstance(command, Send)]
+    assert [command.path for command in sends] == [WWAN, WLAN]
+    assert sends[0].message is sends[1].message
+    assert sends[0].message.sharing is not None
+
+
+@pytest.mark.parametrize(("state", "ways"), [(PathState.DOWN, [WLAN]), (PathState.UNSTABLE, [WLAN])])
+def test_an_answer_leaves_out_the_paths_that_are_not_up_meanwhile(state: PathState, ways: list[PathId]) -> None:
+    cloud = Cloud()
+    cloud.routes.set_state(WWAN, state)
+    cloud.answers.send([reply(1, 0, WWAN, WLAN)], 0.0)
+    assert cloud.sent() == [(1, 0, way) for way in ways]
+
+
+def test_the_answers_to_a_race_are_not_shared() -> None:
+    cloud = Cloud()
+    cloud.answers.send([reply(RACE, 0, WWAN, WLAN)], 0.0)
+    assert [command.path for command in cloud.commands if isinstance(command, Send)] == [WWAN]
+
+
+def test_a_copy_that_comes_again_and_again_under_other_services_is_rejected_once() -> None:
+    cloud = Cloud()
+    for number in range(100):
+        refused = RejectionMessage(request_id(1), 0, RejectReason.NOT_OFFERED, f"no server for /service_{number}")
+        cloud.answers.send([Reply(ReplyTo(WLAN, 0), ECHO, refused, Priority.NORMAL, 5.0, 10.0)], 0.0)
+    assert len(cloud.answers) == 1

@@ -19,7 +19,7 @@ from plr.sidecar.core.message.reassembly import (
 from plr.sidecar.core.message.symbols import MessageSymbols
 from plr.sidecar.core.wire.frame import MAX_MESSAGE_BYTES, Fragment, symbol_count
 from plr.sidecar.core.wire.messages import Encoded
-from tests.support.builders import A
+from tests.support.builders import WLAN, WWAN, A, path
 
 SYMBOL = 256
 
@@ -263,3 +263,11 @@ def test_finished_numbers_are_remembered_up_to_a_cap(reassembler: Reassembler) -
     assert contents(reassembler.add(symbols(1, b"x"), 1.0)) == []
     assert contents(reassembler.add(symbols(0, b"x"), 1.0)) == [b"x"], "the oldest was forgotten"
     assert len(reassembler._over) == OVER_REMEMBERED
+
+
+def test_a_message_tells_by_which_paths_it_came(reassembler: Reassembler) -> None:
+    every = symbols(1, bytes(1001))
+    reassembler.add(every[:1], 1.0, path(WLAN))
+    reassembler.add(every[1:2], 1.0, path(WWAN))
+    (found,) = reassembler.add(every[2:], 1.0, path(WLAN))
+    assert found.paths == [path(WLAN), path(WWAN)]

@@ -66,3 +66,18 @@ def test_threads_that_take_at_once_get_each_symbol_once() -> None:
     for thread in threads:
         thread.join()
     assert sorted(index for mine in taken for index in mine) == list(range(count))
+
+
+def test_what_got_lost_is_taken_again_before_all_others_and_once() -> None:
+    sharing = Sharing(6, 0)
+    assert sharing.take(4, always) == (0, 4)
+    sharing.give_back((1, 2, 5))
+    sharing.give_back((2,))
+    assert sharing.untaken == 4, "5 was untaken anyway"
+    assert sharing.take(9, always) == (1, 2)
+    assert sharing.take(9, always) == (4, 2)
+    assert sharing.take(9, always) is None
+    sharing.give_back((0,))
+    assert sharing.take_all() == (0,)
+    sharing.give_back((0,))
+    assert sharing.untaken == 1

@@ -130,3 +130,43 @@ def test_what_is_over_is_forgotten_and_what_expired_is_not_repeated() -> None:
     over.over = True
     assert take(second, now=3.0) is None
     assert len(second) == 0
+
+
+def test_what_another_path_lost_is_taken_by_whoever_looks_again() -> None:
+    outbound = shared(repeats=0.0)
+    first, second = both(outbound)
+    assert take(first, MUCH) == (1, 0, outbound.count)
+    assert take(second) is None
+    assert len(second) == 0
+    assert outbound.sharing is not None
+    outbound.sharing.give_back((3, 4))
+    second.resend(outbound, ())
+    assert take(second, MUCH) == (1, 3, 2)
+    assert take(second) is None
+    assert len(second) == 0
+
+
+def test_nothing_is_repeated_without_capacity_to_spare() -> None:
+    outbound = shared()
+    first, second = both(outbound)
+    take(first, MUCH)
+    assert second.take(0.0, ONE, PACE, RTT_S, repeats=False) is None
+    assert take(second) == (1, outbound.count - 1, 1)
+
+
+def test_what_can_be_in_time_is_repeated_before_what_waits_and_is_late() -> None:
+    outbound, late = shared(), message(2, 12_000, deadline=1.0, expires=99.0)
+    first, second = SendQueue(), SendQueue()
+    first.add(outbound)
+    take(first, MUCH, now=2.0)
+    second.add(outbound)
+    second.add(late)
+    assert take(second, now=2.0) == (1, outbound.count - 1, 1)
+    assert second.take(2.0, ONE, PACE, RTT_S, repeats=False) is not None, "the late one"
+    outbound.over = True
+    assert take(second, now=2.0) == (2, 1, 1)
+
+
+def test_a_path_that_dies_tells_of_what_it_carried_with_others() -> None:
+    first, _ = both(shared())
+    assert [indices for _, indices in first.clear()] == [()]

@@ -400,3 +400,90 @@ def test_a_forgotten_message_is_sent_again_but_not_for_ever() -> None:
     box.outbox.on_forgotten(A, message.number)
     assert (len(box.outbox), box.outbox.held_bytes, box.commands) == (0, 0, [])
     assert box.stats.dropped["message_forgotten"] == MAX_GENERATIONS + 1
+
+
+def share(box: Box, *others: PathId, size: int = 30_000) -> OutboundMessage:
+    """Over wlan0 and these."""
+    message = box.outbox.send(
+        OVER_WLAN,
+        Encoded(b"", bytes(size)),
+        priority=Priority.NORMAL,
+        deadline=1.0,
+        expires=10.0,
+        shared_by=others,
+        repeats=1.0,
+    )
+    assert box.commands == [Send(each, message.symbols) for each in (OVER_WLAN, *others)]
+    box.commands.clear()
+    return message
+
+
+def untaken(message: OutboundMessage) -> int:
+    assert message.symbols.sharing is not None
+    return message.symbols.sharing.untaken
+
+
+def all_taken(message: OutboundMessage) -> None:
+    assert message.symbols.sharing is not None
+    message.symbols.sharing.take_all()
+
+
+def test_what_one_path_lost_of_a_shared_message_may_leave_by_each_that_is_up() -> None:
+    box = Box(OVER_WLAN, OVER_WWAN)
+    message = share(box, OVER_WWAN)
+    all_taken(message)
+    box.lost(message, 1, 2)
+    assert box.commands == [Resend(each, message.symbols, ()) for each in (OVER_WLAN, OVER_WWAN)]
+    assert untaken(message) == 2
+    box.commands.clear()
+    box.routes.set_state(OVER_WLAN, PathState.UNSTABLE)
+    box.lost(message, 3)
+    assert box.commands == [Resend(OVER_WWAN, message.symbols, ())]
+
+
+def test_lost_symbols_of_a_shared_message_leave_by_a_path_that_is_not_up_only_for_want_of_one() -> None:
+    box = Box(OVER_WLAN, OVER_WWAN)
+    message = share(box, OVER_WWAN)
+    for each in (OVER_WLAN, OVER_WWAN):
+        box.routes.set_state(each, PathState.UNSTABLE)
+    box.lost(message, 3, timed_out=True)
+    assert box.commands == [Resend(OVER_WWAN, message.symbols, (3,))]
+    assert untaken(message) == message.symbols.count, "for the first that is up again"
+
+
+def test_a_shared_message_goes_over_another_path_when_none_of_its_own_is_left() -> None:
+    third = path("wwan1")
+    box = Box(OVER_WLAN, OVER_WWAN, third)
+    message = share(box, OVER_WWAN)
+    for each in (OVER_WLAN, OVER_WWAN):
+        box.routes.set_state(each, PathState.DOWN)
+    box.lost(message, over=OVER_WWAN)
+    assert box.commands == [Resend(third, message.symbols, tuple(range(message.symbols.count)))]
+    assert untaken(message) == 0
+
+
+def test_a_shared_message_that_waited_for_a_path_leaves_by_the_one_that_comes() -> None:
+    box = Box(OVER_WLAN, OVER_WWAN)
+    message = share(box, OVER_WWAN)
+    for each in (OVER_WLAN, OVER_WWAN):
+        box.routes.set_state(each, PathState.DOWN)
+    box.lost(message)
+    assert box.commands == []
+    box.come_up(OVER_WWAN)
+    assert box.commands == [Resend(OVER_WWAN, message.symbols, ())]
+    assert untaken(message) == message.symbols.count
+
+
+def test_a_shared_message_that_is_cut_again_is_still_shared() -> None:
+    box = Box(OVER_WLAN, OVER_WWAN)
+    for each in (OVER_WLAN, OVER_WWAN):
+        box.routes.set_max_datagram(each, 1400)
+    message = share(box, OVER_WWAN)
+    for each in (OVER_WLAN, OVER_WWAN):
+        box.routes.set_max_datagram(each, BASE_BYTES)
+    box.lost(message)
+    again = message.newest
+    assert again is not message
+    sent = [command for command in box.commands if isinstance(command, Send)]
+    assert {command.path for command in sent} == {OVER_WLAN, OVER_WWAN}
+    assert all(command.message is again.symbols for command in sent)

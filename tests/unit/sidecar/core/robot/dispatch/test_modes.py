@@ -8,6 +8,7 @@ import pytest
 
 from plr.protos.model.redundancy_mode import RedundancyMode
 from plr.sidecar.core.base.values import PathId, PathState, RejectReason
+from plr.sidecar.core.robot.dispatch.dispatcher import SMALL_REQUEST_BYTES
 from plr.sidecar.core.robot.request.request import HEDGE_AT, Request
 from plr.sidecar.core.rules.budget import Budget
 from tests.support.builders import ECHO, WLAN, WWAN, A, B, path, request_id
@@ -170,8 +171,8 @@ def test_without_budget_there_are_no_extra_copies_but_always_a_first_one() -> No
         assert table.sent() == []
         table.reject(RejectReason.OVERLOADED)
         assert table.sent() == [WWAN_B], "in place of the first one"
-        refused = {RedundancyMode.SINGLE: 0, RedundancyMode.ADAPTIVE: 2, RedundancyMode.REPLICATE: 2}
-        assert sum(table.stats.copies_refused.values()) == refused.get(mode, 1)
+        refused = {RedundancyMode.SINGLE: 0, RedundancyMode.BACKUP: 1, RedundancyMode.HEDGE: 1}
+        assert sum(table.stats.copies_refused.values()) == refused.get(mode, 2)
 
 
 def test_extra_copies_and_their_bytes_are_counted() -> None:
@@ -180,6 +181,10 @@ def test_extra_copies_and_their_bytes_are_counted() -> None:
     first, extra = table.stats.copy_bytes[WLAN, ECHO, "first"], table.stats.copy_bytes[WWAN, ECHO, "extra"]
     assert first == extra
     assert 1000 < first < 1200
+
+
+LARGE = bytes(2 * SMALL_REQUEST_BYTES)
+"""The payload of a request that is shared."""
 
 
 def sharing_table(*, budgets: tuple[Budget, ...] = ()) -> Table:
@@ -199,7 +204,7 @@ def in_flight(table: Table, number: int = 1) -> Request:
 
 def test_a_shared_request_goes_to_one_server_over_every_mapped_interface_as_one_message() -> None:
     table = sharing_table()
-    table.submit()
+    table.submit(payload=LARGE)
     request = in_flight(table)
     assert table.sent() == [WLAN_A, WWAN_A]
     assert [copy.paths for copy in request.copies] == [(WLAN_A, WWAN_A)]
@@ -208,34 +213,34 @@ def test_a_shared_request_goes_to_one_server_over_every_mapped_interface_as_one_
 
 def test_a_race_of_shared_requests_measures_each_mapped_pair() -> None:
     table = sharing_table()
-    table.submit(RACE)
+    table.submit(RACE, LARGE)
     assert table.sent() == [WLAN_A, WWAN_B]
     assert in_flight(table, RACE).observed
 
 
 def test_shared_requests_stay_with_their_server_though_another_becomes_faster() -> None:
     table = sharing_table()
-    table.submit(1)
+    table.submit(1, LARGE)
     table.routes.set_rtt(WWAN_B, 0.001)
-    table.submit(2)
+    table.submit(2, LARGE)
     assert table.sent() == [WLAN_A, WWAN_A] * 2
 
 
 def test_shared_requests_follow_the_server_that_answers_what_the_other_one_holds() -> None:
     table = sharing_table()
-    table.submit(1)
+    table.submit(1, LARGE)
     in_flight(table).copies[0].message.end()
     table.handle_timers(HEDGE_AT * table.rule.deadline_s)
     assert table.sent() == [WLAN_A, WWAN_A, WWAN_B]
     table.respond(number=1, copy=1, server=B, now=0.6)
     assert table.sent() == [WLAN_A], "the copy there is called off"
-    table.submit(2, now=0.7)
+    table.submit(2, LARGE, now=0.7)
     assert table.sent() == [WWAN_B, WLAN_B]
 
 
 def test_a_shared_request_is_in_trouble_when_all_its_paths_are() -> None:
     table = sharing_table()
-    table.submit()
+    table.submit(payload=LARGE)
     table.change(WLAN_A, PathState.DOWN)
     assert table.sent() == [WLAN_A, WWAN_A]
     table.change(WWAN_A, PathState.UNSTABLE)
@@ -244,5 +249,11 @@ def test_a_shared_request_is_in_trouble_when_all_its_paths_are() -> None:
 
 def test_an_interface_without_budget_does_not_share() -> None:
     table = sharing_table(budgets=(Budget(WWAN, extra_bytes_a_day=0),))
-    table.submit()
+    table.submit(payload=LARGE)
     assert table.sent() == [WLAN_A]
+
+
+def test_a_small_request_goes_over_each_mapped_pair_whole() -> None:
+    table = sharing_table()
+    table.submit(payload=bytes(SMALL_REQUEST_BYTES // 2))
+    assert table.sent() == [WLAN_A, WWAN_B]
