@@ -27,7 +27,7 @@ from plr.sidecar.config.fields import (
 from plr.sidecar.core.base.values import Priority
 from plr.sidecar.core.robot.fallback.queue import SPARE
 from plr.sidecar.core.rules.budget import Budget
-from plr.sidecar.core.rules.service_rule import MAX_LIFETIME_S, FallbackRule, ServiceRule
+from plr.sidecar.core.rules.service_rule import DEFAULT_REPEATS, MAX_LIFETIME_S, FallbackRule, ServiceRule
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -172,6 +172,10 @@ class ServiceConfig(Section):
     )
     """With `redundancy: hedge` only. The next copy is sent when the answer takes longer than this share of the recent
     answers over that pair, at half the deadline at the latest."""
+    repeats: Annotated[float, Field(ge=0, le=1), _ROBOT] = DEFAULT_REPEATS
+    """With `redundancy: share` only. Interfaces with capacity to spare repeat up to this share of a request that others
+    carry. With 1, an interface that goes dark costs no time. With 0, nothing travels twice, and what such an interface
+    carried is missing until that is noticed."""
     copies: Annotated[CopiesWanted | None, _ROBOT] = None
     """Over how many interfaces the control plane maps copies of a request.
 
@@ -248,6 +252,7 @@ class ServiceConfig(Section):
             capacity=self.capacity_interfaces or _UNLIMITED,
             redundancy=self.redundancy,
             hedge_quantile=self.hedge_quantile,
+            repeats=self.repeats,
             adaptive_target=self.target_miss or DEFAULT_ADAPTIVE_TARGET,
             copies=self.copies or (AT_MOST_EVERY_INTERFACE if cheapest else EVERY_INTERFACE),
             target_miss=(self.target_miss or 0.0) if cheapest else 0.0,
@@ -278,6 +283,8 @@ class ServiceConfig(Section):
             yield "redundancy", f"expected {word} beside idempotent: true only, as copies run on several servers"
         if self.redundancy is not RedundancyMode.HEDGE and "hedge_quantile" in self.model_fields_set:
             yield "hedge_quantile", "expected only beside redundancy: hedge"
+        if self.redundancy is not RedundancyMode.SHARE and "repeats" in self.model_fields_set:
+            yield "repeats", "expected only beside redundancy: share"
         if "exploration" in self.model_fields_set and self.exploration and not self.idempotent:
             yield "exploration", "expected beside idempotent: true, as copies would run on several servers"
         yield from self._fallback_problems()

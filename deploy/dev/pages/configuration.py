@@ -23,6 +23,7 @@ SEE = {
         "services[].deadline_ms": "[what happens on a miss](../start/first-service.md#what-happens-on-a-miss)",
         "services[].redundancy": "[choosing one](redundancy.md#choosing-one)",
         "services[].hedge_quantile": "[when the hedge is sent](redundancy.md#when-the-hedge-is-sent)",
+        "services[].repeats": "[when a request is shared](redundancy.md#when-a-request-is-shared)",
         "services[].copies": "[fewer copies](objectives.md#fewer-copies-and-copies-that-do-not-fail-together)",
         "services[].mode": "[the least cost](objectives.md#the-least-cost)",
         "services[].target_miss": "[when an adaptive copy is sent](redundancy.md#when-an-adaptive-copy-is-sent)",

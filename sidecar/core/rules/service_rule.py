@@ -22,6 +22,9 @@ if TYPE_CHECKING:
     from plr.protos.model.ids import ServiceName
     from plr.sidecar.core.message.repair import Redundancy
 
+DEFAULT_REPEATS = 1.0
+"""With less, a path that goes dark costs a probe timeout: not all that it carried has been repeated."""
+
 
 @dataclass(frozen=True, slots=True)
 class FallbackRule:
@@ -86,6 +89,8 @@ class ServiceRule:
     """Robot, with RedundancyMode.HEDGE: the share of first copies that is waited for."""
     adaptive_target: float = DEFAULT_ADAPTIVE_TARGET
     """Robot, with RedundancyMode.ADAPTIVE: the probability of a deadline miss that further copies are to keep."""
+    repeats: float = DEFAULT_REPEATS
+    """Robot, with RedundancyMode.SHARE: the share of a request that its paths may repeat."""
     copies: Copies = EVERY_INTERFACE
     """Robot: how many copies of a request the control plane may map."""
     target_miss: float = 0.0

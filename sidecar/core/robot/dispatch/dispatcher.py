@@ -127,8 +127,7 @@ class Dispatching:
 
         Return False if none of them is up, or such a request is not to be shared.
         """
-        repeats = MODES[request.rule.redundancy].shares
-        if repeats is None or request.races or request.size <= SMALL_REQUEST_BYTES:
+        if not MODES[request.rule.redundancy].shares or request.races or request.size <= SMALL_REQUEST_BYTES:
             return False
         server = self._favourite(request.service, servers, chosen)
         if server is None:
@@ -136,7 +135,7 @@ class Dispatching:
         first, *others = self._parts.mapping.up_to(server, chosen)
         size = request.size
         others = [path for path in others if self._budgets.allows(path.interface, request.service, size, now)]
-        self._send(request, first, now, _Why.MAPPED, shared_by=tuple(others), repeats=repeats)
+        self._send(request, first, now, _Why.MAPPED, shared_by=tuple(others), repeats=request.rule.repeats)
         request.withheld = tuple(path for path in chosen if path.peer != server)
         return True
 

@@ -52,8 +52,8 @@ class Mode:
     """Whether every mapped pair carries a copy from the start."""
     replaces_lost = False
     """Whether a copy of which nothing is heard is replaced before its path is known to be down."""
-    shares: float | None = None
-    """Paths of several interfaces carry one copy together, and repeat up to this share of it; None: they do not."""
+    shares = False
+    """Whether paths of several interfaces carry one copy together."""
 
     def slowness(self, sender: Sender, request: Request, path: PathId, now: float) -> float:
         """Return what the mapped paths that are up are sorted by, the best with the least."""
@@ -154,14 +154,14 @@ class AdaptiveMode(Mode):
 
 
 class Share(Backup):
-    """Sends one copy to one server over all mapped interfaces together; spare capacity repeats all of it.
+    """Sends one copy to one server over all mapped interfaces together; spare capacity repeats a share of it.
 
     Full races go over every mapped pair at once, so that each is measured.
     """
 
     at_once = True
     replaces_lost = False
-    shares = 1.0
+    shares = True
 
 
 class Replicate(Backup):

@@ -45,6 +45,8 @@ BAD_VALUES: list[tuple[dict[str, Any], str, str]] = [
     (with_service(ROBOT, redundancy="adaptive"), "services[0].redundancy", "expected adaptive beside idempotent: true"),
     (with_service(CLOUD, redundancy="single"), "services[0].redundancy", "on a robot only"),
     (with_service(ROBOT, hedge_quantile=0.9), "services[0].hedge_quantile", "only beside redundancy: hedge"),
+    (with_service(ROBOT, repeats=0.5), "services[0].repeats", "only beside redundancy: share"),
+    (with_service(ROBOT, redundancy="share", repeats=1.5), "services[0].repeats", "1"),
     (with_service(ROBOT, hedge_quantile=1), "services[0].hedge_quantile", "0.99"),
     (with_service(CLOUD, fallback="/b"), "services[0].fallback", "on a robot only"),
     (with_service(ROBOT, fallback="/b"), "services[0].fallback", "beside idempotent: true only"),

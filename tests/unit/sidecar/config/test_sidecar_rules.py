@@ -69,6 +69,8 @@ def test_how_many_copies_are_sent_and_when() -> None:
     (rule,) = parse(changed).service_rules()
     assert (rule.redundancy, rule.hedge_quantile) == (RedundancyMode.HEDGE, 0.9)
     assert rule.adaptive_target == 0.001
+    (rule,) = parse(with_service(ROBOT, redundancy="share", repeats=1)).service_rules()
+    assert (rule.redundancy, rule.repeats) == (RedundancyMode.SHARE, 1.0)
     changed = with_service(ROBOT, idempotent=True, redundancy="adaptive", target_miss=0.01)
     (rule,) = parse(changed).service_rules()
     assert (rule.redundancy, rule.adaptive_target) == (RedundancyMode.ADAPTIVE, 0.01)
