@@ -49,10 +49,9 @@ class EngineTurn:
         """Return the engine, and the time."""
         self._lock.acquire()
         try:
-            now = self._clock()
-            slept_s = self._suspension.slept_s(now, self._boot_clock())
-            if slept_s:
-                self._engine.on_woken(slept_s, now)
+            now, booted = self._clock(), self._boot_clock()
+            if booted - now >= self._suspension.noticed_at_s:
+                self._engine.on_woken(self._suspension.slept_s(now, booted), now)
         except BaseException:
             self._lock.release()
             raise

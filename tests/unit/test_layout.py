@@ -117,7 +117,6 @@ controlplane/core/solve/path_bound.py
 controlplane/core/solve/server_groups.py
 sidecar/core/base/report_scope.py
 sidecar/core/base/values.py
-sidecar/core/cloud/answer_cache.py
 sidecar/core/engine/revocation_exchange.py
 sidecar/core/engine/role.py
 sidecar/core/link/liveness.py

@@ -43,7 +43,10 @@ class AnswerCache:
         self._sizes.setdefault(robot, OrderedDict())[request_id] = size
         self._bytes[robot] = self._bytes.get(robot, 0) + size
         self.held_bytes += size
-        self._note(robot)
+        heapq.heappush(self._greediest, (-self._bytes[robot], robot))
+        if len(self._greediest) > 2 * len(self._bytes) + HEAP_SLACK:
+            self._greediest = [(-held, name) for name, held in self._bytes.items()]
+            heapq.heapify(self._greediest)
         evicted: list[tuple[NodeName, RequestId]] = []
         while self.held_bytes > self._capacity and len(evicted) < EVICTED_AT_ONCE:
             greediest = self._find_greediest()
@@ -51,12 +54,6 @@ class AnswerCache:
             self.remove(greediest, oldest)
             evicted.append((greediest, oldest))
         return evicted
-
-    def _note(self, robot: NodeName) -> None:
-        heapq.heappush(self._greediest, (-self._bytes[robot], robot))
-        if len(self._greediest) > 2 * len(self._bytes) + HEAP_SLACK:
-            self._greediest = [(-held, name) for name, held in self._bytes.items()]
-            heapq.heapify(self._greediest)
 
     def _find_greediest(self) -> NodeName:
         """Return the robot that holds the most; correct entries at the top that say more than is true now."""

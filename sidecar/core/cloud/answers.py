@@ -311,7 +311,9 @@ class Answers:
         reply = answer.reply
         to = answer.sent[copy] = answer.waiting.pop(copy)
         self._forget_got(answer)
-        path, *others = self._carriers(to, answer.request_id)
+        path, *others = self._carriers(to, answer.request_id) if to.beside else (to.path,)
+        if self._routes.state(path) is PathState.DOWN:
+            path = self._routes.best_to(path.peer) or path
         rule = self._rules.find(reply.service)
         message = reply.message
         self._outbox.send(
@@ -334,8 +336,6 @@ class Answers:
         """
         state, beside = self._routes.state, () if is_race(request_id) else to.beside
         carriers = [path for path in (to.path, *beside) if state(path) is PathState.UP]
-        if not carriers and state(to.path) is PathState.DOWN:
-            return [self._routes.best_to(to.path.peer) or to.path]
         return carriers or [to.path]
 
     def _line_up(self, answer: _Answer) -> None:

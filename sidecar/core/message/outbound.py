@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 from plr.sidecar.core.wire import fec
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
+    from collections.abc import Collection, Iterable
 
     from plr.protos.model.ids import NodeName
     from plr.sidecar.core.base.values import PathId, RequestId
@@ -41,7 +41,7 @@ class OutboundMessage:
         answers: RequestId | None = None,
         copy_of: RequestId | None = None,
         generation: int = 0,
-        shared_by: Iterable[PathId] = (),
+        shared_by: Collection[PathId] = (),
     ) -> None:
         self.path = path
         """The path it was first sent over."""
@@ -49,8 +49,10 @@ class OutboundMessage:
         """The paths that carry it together, or the one that it was first sent over."""
         self.symbols = symbols
         self.number = symbols.number
-        self.interfaces = {carrier.interface for carrier in self.carriers}
+        self.interfaces = {path.interface}
         """The interfaces it was sent over."""
+        for other in shared_by:
+            self.interfaces.add(other.interface)
         self.answers = answers
         """The request that it answers."""
         self.copy_of = copy_of
@@ -99,7 +101,7 @@ class OutboundMessage:
         """Let nothing of it travel any more."""
         self.symbols.over = True
 
-    def cut_again(self, number: int, path: PathId, symbol: int, shared_by: Iterable[PathId] = ()) -> OutboundMessage:
+    def cut_again(self, number: int, path: PathId, symbol: int, shared_by: Collection[PathId] = ()) -> OutboundMessage:
         """Return the same bytes as another message, for paths that carry at most `symbol` bytes at once."""
         symbols = self.symbols.cut_again(number, symbol)
         self.successor = OutboundMessage(

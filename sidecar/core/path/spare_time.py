@@ -11,7 +11,7 @@ from itertools import count
 from typing import TYPE_CHECKING
 
 from plr.sidecar.core.base.timers import NEVER
-from plr.sidecar.core.path.turn import SharedTurn, SymbolRun, most_symbols
+from plr.sidecar.core.path.turn import LOOK_AGAIN_S, SharedTurn, SymbolRun, most_symbols
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -40,7 +40,12 @@ class SpareTime:
         self.members[entry.message.number] = entry
         self._list(entry)
         if look_at is not None:
-            heapq.heappush(self._declined, (look_at, next(self._order), entry))
+            self._look_again(entry, look_at)
+
+    def _look_again(self, entry: SharedTurn, at: float) -> None:
+        if not entry.declined:
+            entry.declined = True
+            heapq.heappush(self._declined, (at, next(self._order), entry))
 
     def _list(self, entry: SharedTurn) -> None:
         if not entry.listed:
@@ -59,6 +64,7 @@ class SpareTime:
         declined = self._declined
         while declined and declined[0][0] <= now:
             entry = heapq.heappop(declined)[2]
+            entry.declined = False
             if not self._is_member(entry):
                 continue
             if entry.message.over:
@@ -98,6 +104,8 @@ class SpareTime:
                 self._unlist()
                 if entry.has_left:
                     self._end(entry)
+                else:  # something got lost meanwhile, and may be taken again
+                    self._look_again(entry, now + LOOK_AGAIN_S)
         return None
 
     def _is_member(self, entry: SharedTurn) -> bool:
@@ -114,7 +122,9 @@ class SpareTime:
         self.members = {number: entry for number, entry in self.members.items() if not entry.message.over}
         for item in self._repeatable:
             item[-1].listed = self._is_member(item[-1])
-        self._declined[:] = [item for item in self._declined if self._is_member(item[-1])]
+        for *_, entry in self._declined:
+            entry.declined = self._is_member(entry)
+        self._declined[:] = [item for item in self._declined if item[-1].declined]
         self._repeatable[:] = [item for item in self._repeatable if item[-1].listed]
         heapq.heapify(self._declined)
         heapq.heapify(self._repeatable)

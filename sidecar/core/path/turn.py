@@ -129,7 +129,7 @@ class Turn:
 class SharedTurn(Turn):
     """One message on one of the paths that carry it together (`message/sharing.py`)."""
 
-    __slots__ = ("_carried", "_newest", "_sharing", "listed")
+    __slots__ = ("_carried", "_newest", "_sharing", "declined", "listed")
 
     def __init__(self, message: MessageSymbols, sharing: Sharing, *, repeats: bool) -> None:
         """Join the paths that carry the message; `repeats`: repeat in spare time what the others carry."""
@@ -142,6 +142,8 @@ class SharedTurn(Turn):
         """Each later symbol has left over this path or arrived."""
         self.listed = False
         """Whether it is in the list of what may be repeated."""
+        self.declined = False
+        """Whether it is in the list of what is left to others and looked at again."""
         sharing.join(self)
 
     def take(self, most: int) -> tuple[int, int] | None:

@@ -63,7 +63,7 @@ class Inbound:
             if isinstance(content, Partial):
                 self._line.add(Decoding(path, session, content))
             elif content is not None:
-                whole.append(Arrived(content, ends_at, _beside(path, paths)))
+                whole.append(Arrived(content, ends_at, _beside(path, paths) if len(paths) > 1 else ()))
         return whole
 
     def on_finished_lost(self, peer: NodeName, numbers: tuple[int, ...], best: PathId | None) -> None:
@@ -126,7 +126,7 @@ class Inbound:
 
 
 def _beside(path: PathId, paths: Sequence[PathId]) -> tuple[PathId, ...]:
-    return tuple(other for other in paths if other != path) if len(paths) > 1 else ()
+    return tuple(other for other in paths if other != path)
 
 
 def _is_small(content: memoryview | Partial | None) -> bool:

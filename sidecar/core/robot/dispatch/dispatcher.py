@@ -83,7 +83,7 @@ class Dispatching:
         servers = self._favoured(servers, now)
         chosen = self._parts.mapping.choose(request.service, servers, idempotent=rule.idempotent)
         mode = MODES[rule.redundancy]
-        if self._share(request, servers, chosen, now):
+        if mode.shares and self._share(request, servers, chosen, now):
             pass
         elif mode.at_once:
             self._send_all(request, self._best_first(request, chosen, now) if self._budgets.limit else chosen, now)
@@ -127,7 +127,7 @@ class Dispatching:
 
         Return False if none of them is up, or such a request is not to be shared.
         """
-        if not MODES[request.rule.redundancy].shares or request.races or request.size <= SMALL_REQUEST_BYTES:
+        if request.races or request.size <= SMALL_REQUEST_BYTES:
             return False
         server = self._favourite(request.service, servers, chosen)
         if server is None:

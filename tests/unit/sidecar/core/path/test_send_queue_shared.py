@@ -170,3 +170,16 @@ def test_what_can_be_in_time_is_repeated_before_what_waits_and_is_late() -> None
 def test_a_path_that_dies_tells_of_what_it_carried_with_others() -> None:
     first, _ = both(shared())
     assert [indices for _, indices in first.clear()] == [()]
+
+
+def test_what_is_lost_while_a_path_has_nothing_left_is_looked_at_again() -> None:
+    outbound = shared(repeats=0.0)
+    first, second = both(outbound)
+    assert take(first, MUCH) == (1, 0, outbound.count)
+    assert second.take(0.0, ONE, PACE, RTT_S, repeats=False) is None
+    assert outbound.sharing is not None
+    outbound.sharing.give_back((3,))
+    assert take(second) is None, "it has nothing to repeat"
+    assert take(second, now=LOOK_AGAIN_S) == (1, 3, 1)
+    assert take(second, now=LOOK_AGAIN_S) is None
+    assert len(second) == 0
