@@ -34,8 +34,10 @@ if TYPE_CHECKING:
     from plr.sidecar.core.message.symbols import MessageSymbols
     from plr.sidecar.core.path.turn import Turn
 
-PURGE_AT = 64
+PURGE_AT = 8
 """Entries that trigger the first search for messages that are over; the next one comes at twice their number."""
+LOOK_AT_LEAST_EVERY_S = 1.0
+"""So often an idle path looks whether what it might repeat is over (s), so as not to hold it in memory."""
 BEGUN = float("-inf")
 """Sort key of begun messages, before the other late ones."""
 _Entry: TypeAlias = "tuple[float, int, Turn]"
@@ -162,6 +164,8 @@ class SendQueue:
         waiting = [
             each for each in self._classes if any(each.heaps) and self._head(each, now, pace, round_trip_s) is not None
         ]
+        if spare_time.members:
+            spare_time.drop_over(now)
         may_repeat = repeats and bool(spare_time.members)
         if may_repeat and not any(each.fresh for each in waiting):
             run = spare_time.take(now, budget, round_trip_s, late=False)
@@ -181,7 +185,7 @@ class SendQueue:
             return run
         run = spare_time.take(now, budget, round_trip_s) if may_repeat else None
         if run is None and spare_time.members:
-            self.rests_until = spare_time.next_look
+            self.rests_until = min(spare_time.next_look, now + LOOK_AT_LEAST_EVERY_S)
         return run
 
     def _note_turn(self, waiting: list[_Class], chosen: _Class, symbols: int) -> None:

@@ -57,7 +57,18 @@ class SpareTime:
 
     def remove(self, number: int) -> bool:
         """Remove a message if it is here; return whether it was."""
-        return self.members.pop(number, None) is not None
+        was_here = self.members.pop(number, None) is not None
+        if not self.members:  # an idle path holds no message in memory
+            self._forget_lists()
+        return was_here
+
+    def _forget_lists(self) -> None:
+        for *_, entry in self._declined:
+            entry.declined = False
+        for *_, entry in self._repeatable:
+            entry.listed = False
+        self._declined.clear()
+        self._repeatable.clear()
 
     def due(self, now: float) -> Iterator[SharedTurn]:
         """Remove and yield what is to be looked at again by now."""
@@ -80,21 +91,32 @@ class SpareTime:
         """When to look again at what is left to other paths (s); NEVER if nothing is."""
         return self._declined[0][0] if self._declined else NEVER
 
+    def drop_over(self, now: float) -> None:
+        """End the messages at the head that need nothing more, even while something else goes first."""
+        repeatable = self._repeatable
+        while repeatable:
+            entry = repeatable[0][-1]
+            if not self._is_member(entry):
+                self._unlist()
+            elif entry.message.over or entry.message.expires <= now:
+                self._unlist()
+                self._end(entry)
+            else:
+                break
+
     def take(self, now: float, budget: int, round_trip_s: float, *, late: bool = True) -> SymbolRun | None:
         """Return symbols that other paths carry, of the message that is most urgent and can still be in time.
 
         `late`: if there is none, return those of a message that is too late.
         """
         repeatable = self._repeatable
-        while repeatable:
+        while True:
+            self.drop_over(now)
+            if not repeatable:
+                return None
             is_late, deadline, order, entry = repeatable[0]
             message = entry.message
-            if not self._is_member(entry):
-                self._unlist()
-            elif message.over or message.expires <= now:
-                self._unlist()
-                self._end(entry)
-            elif not is_late and deadline <= now + round_trip_s:
+            if not is_late and deadline <= now + round_trip_s:
                 heapq.heapreplace(repeatable, (True, deadline, order, entry))
             elif is_late and not late:
                 return None
@@ -106,7 +128,6 @@ class SpareTime:
                     self._end(entry)
                 else:  # something got lost meanwhile, and may be taken again
                     self._look_again(entry, now + LOOK_AGAIN_S)
-        return None
 
     def _is_member(self, entry: SharedTurn) -> bool:
         return self.members.get(entry.message.number) is entry
@@ -132,5 +153,4 @@ class SpareTime:
     def clear(self) -> None:
         """Forget everything."""
         self.members.clear()
-        self._declined.clear()
-        self._repeatable.clear()
+        self._forget_lists()

@@ -206,7 +206,8 @@ class SharedTurn(Turn):
             return None
         symbol = self.message.symbol
         others_s = self._sharing.untaken * symbol / others + their_round_trip_s
-        return now + LOOK_AGAIN_S if others_s < round_trip_s + symbol / max(pace, 1.0) else None
+        here_s = round_trip_s + (symbol / pace if pace else 0.0)  # a path of unknown pace has to try
+        return now + LOOK_AGAIN_S if others_s < here_s else None
 
     def _sending_s(self, pace: float) -> float:
         return (len(self.again) + self._sharing.untaken) * self.message.symbol / pace

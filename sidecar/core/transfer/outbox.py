@@ -268,11 +268,15 @@ class Outbox:
             sharing.give_back(lost)
             for path, state in states.items():
                 if state is PathState.UP:
-                    self._command(Resend(path, message.symbols, ()))
+                    self._let_look(message, path)
             return ()
         if PathState.UNSTABLE in states.values():
             return lost  # what is untaken waits until one of them is up again
         return tuple(sorted({*lost, *sharing.take_all()}))
+
+    def _let_look(self, message: OutboundMessage, path: PathId) -> None:
+        message.interfaces.add(path.interface)
+        self._command(Resend(path, message.symbols, ()))
 
     def _resend(self, message: OutboundMessage, path: PathId, indices: tuple[int, ...]) -> None:
         if message.symbols.datagram_bytes > self._routes.max_datagram(path):
@@ -300,8 +304,20 @@ class Outbox:
         self._enter(again, self._routes.loss(path))
 
     def on_path_up(self, path: PathId) -> list[Step]:
-        """Return the steps that send all that waited for a path to this peer."""
-        return [partial(self._send_rest, message) for message in self._parked.pop(path.peer, {}).values()]
+        """Return the steps that send all that waited for a path to this peer, and let it share again what it shared."""
+        parked = self._parked.pop(path.peer, {})
+        shared = [
+            message
+            for number, message in self._by_peer.get(path.peer, {}).items()
+            if message.symbols.sharing is not None and path in message.carriers and number not in parked
+        ]
+        waiting = [partial(self._send_rest, message) for message in parked.values()]
+        return [*waiting, *in_groups(partial(self._let_look_again, path), shared)]
+
+    def _let_look_again(self, path: PathId, message: OutboundMessage) -> None:
+        sharing = message.symbols.sharing
+        if not message.over and sharing is not None and sharing.untaken:
+            self._let_look(message, path)
 
     def on_interface_gone(self, interface: InterfaceName) -> list[Step]:
         """Return the steps that move messages off an interface whose link is gone, with all it had queued.

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from plr.sidecar.core.message.sharing import OFFER_S
-from plr.sidecar.core.path.send_queue import SendQueue
+from plr.sidecar.core.path.send_queue import LOOK_AT_LEAST_EVERY_S, SendQueue
 from plr.sidecar.core.path.turn import LOOK_AGAIN_S
 from tests.support.builders import message
 
@@ -32,9 +32,15 @@ def both(*messages: MessageSymbols) -> tuple[SendQueue, SendQueue]:
 
 
 def take(
-    queue: SendQueue, budget: int = ONE, now: float = 0.0, pace: float = PACE, rtt_s: float = RTT_S
+    queue: SendQueue,
+    budget: int = ONE,
+    now: float = 0.0,
+    pace: float = PACE,
+    rtt_s: float = RTT_S,
+    *,
+    repeats: bool = True,
 ) -> tuple[int, int, int] | None:
-    run = queue.take(now, budget, pace, rtt_s)
+    run = queue.take(now, budget, pace, rtt_s, repeats=repeats)
     return None if run is None else (run.message.number, run.first, run.symbols)
 
 
@@ -183,3 +189,27 @@ def test_what_is_lost_while_a_path_has_nothing_left_is_looked_at_again() -> None
     assert take(second, now=LOOK_AGAIN_S) == (1, 3, 1)
     assert take(second, now=LOOK_AGAIN_S) is None
     assert len(second) == 0
+
+
+def test_a_path_of_unknown_pace_tries_unless_it_is_farther_away() -> None:
+    outbound = shared(repeats=0.0, size=120_000)
+    first, second = both(outbound)
+    assert take(first) == (1, 0, 1)
+    assert take(second, pace=0.0, rtt_s=9.0) is None
+    assert take(second, now=LOOK_AGAIN_S, pace=0.0) == (1, 1, 1)
+
+
+def test_messages_that_are_over_stay_in_memory_for_a_moment_only() -> None:
+    messages = [shared(number=number) for number in range(1, 5)]
+    first, second = both(*messages)
+    while take(first, MUCH, repeats=False) is not None:
+        pass
+    assert take(second, repeats=False) is None
+    assert len(second) == len(messages), "what may be repeated"
+    assert take(second, now=LOOK_AGAIN_S, repeats=False) is None
+    assert second.rests_until == LOOK_AGAIN_S + LOOK_AT_LEAST_EVERY_S
+    second.add(message(9, 12_000, deadline=1.0, expires=99.0))
+    for each in messages:
+        each.over = True
+    assert take(second, now=LOOK_AGAIN_S, repeats=False) == (9, 0, 1)
+    assert len(second) == 1, "although the other one goes on"

@@ -487,3 +487,30 @@ def test_a_shared_message_that_is_cut_again_is_still_shared() -> None:
     sent = [command for command in box.commands if isinstance(command, Send)]
     assert {command.path for command in sent} == {OVER_WLAN, OVER_WWAN}
     assert all(command.message is again.symbols for command in sent)
+
+
+def test_a_path_that_comes_back_shares_again_what_it_shared() -> None:
+    box = Box(OVER_WLAN, OVER_WWAN)
+    message, other = share(box, OVER_WWAN), box.send()
+    box.routes.set_state(OVER_WLAN, PathState.DOWN)
+    box.come_up(OVER_WLAN)
+    assert box.commands == [Resend(OVER_WLAN, message.symbols, ())]
+    all_taken(message)
+    box.commands.clear()
+    box.come_up(OVER_WLAN)
+    assert box.commands == [], "nothing is left of it"
+    assert not other.over
+
+
+def test_an_interface_that_came_back_and_goes_again_leaves_nothing_of_a_shared_message_behind() -> None:
+    box = Box(OVER_WLAN, OVER_WWAN)
+    message = share(box, OVER_WWAN)
+    box.routes.forget_interface(WLAN)
+    box.do(box.outbox.on_interface_gone(WLAN))
+    box.come_up(OVER_WLAN)
+    box.lost(message, 1)
+    assert WLAN in message.interfaces
+    all_taken(message)
+    box.routes.forget_interface(WLAN)
+    box.do(box.outbox.on_interface_gone(WLAN))
+    assert untaken(message) == message.symbols.count
