@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 EVICTED_AT_ONCE = 1024
 """Answers that one call evicts: a few milliseconds."""
 HEAP_SLACK = 1024
-"""Outdated entries that may remain in the heap before it is built anew."""
+"""Outdated entries that may remain in the heap before it is built again."""
 
 
 class AnswerCache:
