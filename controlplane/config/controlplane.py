@@ -56,65 +56,72 @@ class ControlPlaneConfig(Section):
     model_config = ConfigDict(title="plr-controlplane")
 
     listen: ListenAddress = "[::]:50051"
-    """Where gRPC is served, for sidecars and `plr`. `[::]` means all addresses, IPv4 included; port 0 takes a free
-    one."""
+    """Where the control plane serves gRPC to sidecars and to `plr`. `[::]` means all addresses, including IPv4. Port 0
+    takes a free port."""
     tls_dir: Annotated[TlsDir, converted] | None = None
-    """Required without `insecure`. Folder with `cert.pem`, `key.pem`, `ca.pem` and perhaps `crl.pem`, as
-    `plr ca issue NAME --role controlplane` writes it. It is checked four times a second: new files, above all a
-    revocation list, take effect without a restart."""
+    """Required without `insecure`. Folder with `cert.pem`, `key.pem`, `ca.pem` and perhaps `crl.pem`.
+    `plr ca issue NAME --role controlplane` writes it. The control plane checks the folder four times a second. New
+    files, above all a revocation list, take effect without a restart."""
     insecure: bool = False
-    """`true` in place of `tls_dir`: no TLS, and everybody is who they say. This is for trials on one machine: a
-    `listen` address that others reach is refused unless `--insecure-i-know` is on the command line."""
+    """`true` in place of `tls_dir` turns TLS off. Everyone can then claim any name. Use it only for trials on one
+    machine. The control plane then refuses a `listen` address that others reach, unless the command line contains
+    `--insecure-i-know`."""
     stun_listen: Annotated[
         tuple[ListenAddress, ...], Field(max_length=16, strict=False), OneOrList(), AfterValidator(refuse_duplicates)
     ] = ("[::]:3478",)
-    """Where STUN is answered. An empty list turns it off."""
+    """Where the control plane answers STUN. An empty list turns this off."""
     stun_servers: Annotated[
         tuple[RemoteAddress, ...], Field(max_length=16, strict=False), OneOrList(), AfterValidator(refuse_duplicates)
     ] = ()
-    """STUN servers for the sidecars to ask, as seen from them: this host's public address, others, or both."""
+    """STUN servers that the sidecars ask. Write the addresses at which the sidecars reach them. They may include this
+    host's public address."""
     metrics_listen: ListenAddress | None = "127.0.0.1:9465"
-    """Where Prometheus reads the metrics; `null` for none."""
+    """Where Prometheus reads the metrics. `null` turns this off."""
     state_dir: Annotated[AbsolutePath, converted] | None = None
-    """Folder for the log of events, one for each control plane; it is made if missing. The folder, the folders above it
-    and links on the way must belong to root or the program's user. Without this key events are in memory only, and a
-    restart forgets who is gone. The shipped configuration sets `/var/lib/plr-controlplane`."""
+    """Folder for the log of events. Each control plane needs its own folder. The control plane creates a missing
+    folder. The folder, the folders above it, and symbolic links in its path must belong to root or to the program's
+    user. Without this key, the events are in memory only, and a restart forgets which sidecars are gone. The shipped
+    configuration sets `/var/lib/plr-controlplane`."""
     lease_ms: Annotated[int, Field(ge=500, le=600_000)] = 5000
-    """A sidecar silent for this long leaves its peers' view. It is at least three `report_interval_ms`. With a shorter
-    one, dead servers are forgotten sooner; with a longer one, slow links are not mistaken for dead ones. The sidecars
-    themselves notice dead paths much sooner."""
+    """A sidecar that is silent for this long disappears from its peers' view. The value must be at least three times
+    `report_interval_ms`. With a shorter lease, dead servers are forgotten sooner. With a longer lease, slow links are
+    not mistaken for dead ones. The sidecars themselves notice dead paths much sooner."""
     report_interval_ms: Annotated[int, Field(ge=50, le=60_000)] = 500
-    """How often ten sidecars report what they measured. More sidecars report less often, by about the square root of
-    their number and up to 10 s apart: a thousand every 6.3 s. Their leases are at least three reports long. A changed
-    path or a missed deadline is reported at once."""
+    """Interval at which up to ten sidecars report their measurements. With more sidecars, the interval grows with about
+    the square root of their number, up to 10 s. A thousand sidecars report every 6.3 s. A busy control plane lengthens
+    the interval, too. A lease lasts for at least three intervals. A changed path or a missed deadline is reported at
+    once."""
     warm_up_ms: Annotated[int, Field(ge=0, le=600_000)] = RECONNECT_MAX_MS + 2000
-    """After a start, for at most this long, a robot that still holds peers is not sent a set that lacks some of its
-    servers: they may just not be back yet."""
+    """Longest time after a start for which the control plane waits for servers to return. Until then, a robot that
+    still holds peers gets no set of peers that lacks one of its servers."""
     histogram_half_life_s: Annotated[float, Field(ge=1.0, le=86_400.0)] = 60.0
-    """Half-life of latency samples, and of misses in the longest of the memories that predict. With a shorter one, the
-    mapping follows sooner and rests on fewer samples."""
+    """Half-life of the latency samples. It is also the half-life of misses in the longest of the memories from which
+    misses are predicted. With a shorter half-life, the mapping follows changes sooner, but it rests on fewer
+    samples."""
     default_capacity_interfaces: Annotated[int, Field(ge=0, le=256)] = 1
-    """How many interfaces of one robot may share a server for one service; `0` for no limit. 1 is the paper's value:
-    every interface has its own server. The limit is exceeded by the least amount where servers are too few."""
+    """How many interfaces of one robot may share a server for one service. `0` means no limit. The FogROS2-PLR paper
+    uses 1: every interface has its own server. If servers are too few, the mapping exceeds the limit by as little as
+    possible."""
     objective: Annotated[Objective, converted] = Objective.JOINT
     """What the mapping minimises.
 
-    - `joint`: the probability that all copies of a request miss the deadline, with paths that were seen to fail
-      together counted as such.
-    - `product`: the same as if paths failed independently.
-    - `sum`: the sum of the copies' miss probabilities, as in the paper. It looks at the bad paths first, and ignores
-      how bad all are together."""
+    - `joint`: the probability that all copies of a request miss the deadline. It takes into account which paths were
+      seen to fail together.
+    - `product`: the same probability, as if paths failed independently.
+    - `sum`: the sum of the copies' miss probabilities, as in the FogROS2-PLR paper. The worst paths dominate this sum.
+      It ignores the probability that all copies miss."""
     solver_time_limit_ms: Annotated[int, Field(ge=10, le=60_000)] = 2000
-    """Longest time for one solve; then the incumbent is taken. An urgent solve, after paths died or came back, is
-    limited to 0.1 s, or to 0.25 ms for each service of a robot if that is longer. The next routine solve goes on."""
+    """Longest time for one solve. When it ends, the best plan found so far is used. An urgent solve follows when paths
+    die or return. Its limit is 0.1 s, or 0.25 ms for each service of each robot if that is longer. Such a solve is
+    never longer than this key allows. The next routine solve continues the search."""
     paths: Annotated[tuple[PathRuleConfig, ...], Field(max_length=MAX_PATH_RULES, strict=False)] = ()
-    """Rules on which pairs of an interface and a cloud mappings may use. The first that matches decides; what none
-    matches is allowed. They are for planning, not for protection, which is the task of `policy`."""
+    """Rules that say which pairs of an interface and a cloud a mapping may use. The first matching rule applies. A pair
+    that no rule matches is allowed. The rules are for planning, not for protection. For protection, use `policy`."""
     policy: Annotated[PolicyConfig | None, BeforeValidator(_empty_if_null)] = None
-    """Access control. Without this key everything is allowed. With it, even with nothing after it, what no rule allows
-    is denied."""
+    """Access control. Without this key, everything is allowed. With this key, everything that no rule allows is denied.
+    This also holds for a key with nothing after it."""
     log_level: Literal["debug", "info", "warning", "error"] = "info"
-    """Least level of what is logged to stderr."""
+    """Lowest level that is logged to stderr."""
 
     @model_validator(mode="after")
     def _secured_or_not(self) -> Self:

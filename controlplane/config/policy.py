@@ -35,9 +35,9 @@ class PolicyConfig(Section):
     """What is allowed; everything else is denied."""
 
     calls: Annotated[tuple[CallRuleConfig, ...], Field(max_length=MAX_RULES, strict=False)] = ()
-    """Rules: which robots may call which services on which clouds."""
+    """Rules that say which robots may call which services on which clouds."""
     offers: Annotated[tuple[OfferRuleConfig, ...], Field(max_length=MAX_RULES, strict=False)] = ()
-    """Rules: which clouds may offer which services."""
+    """Rules that say which clouds may offer which services."""
 
     def policy(self) -> Policy:
         """Return the core's rules."""

@@ -95,18 +95,18 @@ class NetworkConfig(Section):
     """The network behind interfaces."""
 
     interface: InterfacePattern
-    """Name or glob of interfaces. Each is written once."""
+    """Name or glob of interfaces. Write each name or glob once."""
     carrier: DomainLabel | None = None
-    """Name of the network's operator. Interfaces with the same carrier are assumed to fail together."""
+    """Name of the network's operator. The control plane assumes that interfaces with the same carrier fail together."""
     cost_per_request: Annotated[float, Field(ge=0, le=MAX_COST_PER_REQUEST)] = DEFAULT_COST_PER_REQUEST
-    """Cost of a copy of a request over it, in any one currency. It counts for services with `mode: cheapest`. The
-    control stream prefers what costs less, too."""
+    """Cost of a copy of a request over this network, in any one currency. It counts for services with `mode: cheapest`.
+    The control stream also prefers networks with a lower cost."""
     extra_load: Annotated[float | None, Field(ge=0, le=MAX_EXTRA_LOAD)] = None
-    """Extra copies over it may weigh this share of all requests answered in time. Each interface that the name matches
-    has a budget of its own. `0` allows no extra copy. Without this key there is no such limit."""
+    """Budget for the bytes of extra copies over this network, as a share of the bytes of all requests answered in time.
+    Each matching interface has its own budget. `0` allows no extra copy. Without this key there is no such limit."""
     extra_mb_per_day: Annotated[float | None, Field(ge=0, le=MAX_EXTRA_MB_PER_DAY)] = None
-    """Extra copies over it may weigh this much in 24 hours. The control stream takes such an interface only while no
-    other leads to the control plane. Without this key there is no such limit."""
+    """Budget for the bytes of extra copies over this network in 24 hours. The control stream uses a matching interface
+    only while no other interface leads to the control plane. Without this key there is no such limit."""
 
     def budget(self) -> Budget:
         """Return the budget in the form that the cores use."""
@@ -118,109 +118,118 @@ class ServiceConfig(Section):
     """One service, or all services whose name matches a glob."""
 
     name: ServicePattern
-    """Full name such as `/plan_path`, or a glob such as `/arm/*`. Each name is written once. A full name comes before a
-    glob that matches it."""
+    """Full name such as `/plan_path`, or a glob such as `/arm/*`. Write each name or glob once. Write a full name
+    before a glob that matches it."""
     type: Annotated[ServiceType | None, _ROBOT] = None
     """Type of the service, such as `nav_msgs/srv/GetPlan`. Servers that offer the service with another type get no
-    requests, however many they are. Without this key the type of most servers counts."""
+    requests. Without this key, the type that most servers offer applies."""
     deadline_ms: Annotated[float | None, Field(gt=0, le=MAX_DEADLINE_MS), _ROBOT] = None
-    """Required. An answer is in time within this many milliseconds. Nothing ends at the deadline."""
+    """Required. An answer is in time if it arrives within this many milliseconds. The request does not end at the
+    deadline."""
     lifetime_ms: Annotated[float | None, Field(gt=0, le=_MAX_LIFETIME_MS)] = None
     """How long an unanswered request lives.
 
-    Robot: an unanswered request is given up after this time, which is longer than `deadline_ms`. The default is 10
-    deadlines, at least 30000 (10000 with `drop_late`) and at most 300000. A service without a path or a server stays
-    offered for the same time, 15 s at least. Then it is withdrawn, and waiting requests are given up.
+    On a robot, the sidecar gives up an unanswered request after this time. The value must be above `deadline_ms`. The
+    default is 10 deadlines, but at least 30000 (10000 with `drop_late`) and at most 300000. A service without a path or
+    a server stays offered for the same time, and for at least 15 s. Then the sidecar withdraws it, and gives up its
+    waiting requests.
 
-    Cloud: a local server that does not answer is given up after this time, and the robot is notified, even if the robot
-    would wait longer. The default is 60000."""
+    On a cloud, the sidecar gives up a local server that does not answer within this time. It notifies the robot, even
+    if the robot would wait longer. The default is 60000."""
     idempotent: Annotated[bool, _ROBOT] = False
     """Whether copies of one request may run on several servers.
 
-    - `true`: they may. If only one server was asked, has the request and is silent at half the deadline, another server
-      is asked (not with `redundancy: single`).
-    - `false`: one server at a time gets the request, over every interface that reaches it."""
+    - `true`: they may. If only one server was asked and it has the request but is silent at half of the deadline, the
+      sidecar asks another server. It does not do this with `redundancy: single`.
+    - `false`: one server at a time gets the request, over every interface that reaches this server."""
     drop_late: Annotated[bool, _ROBOT] = False
-    """`true`: an answer after the deadline is not delivered, so the application gets none."""
+    """`true`: the sidecar does not deliver an answer after the deadline. The application then gets no answer."""
     fec: RepairShare = "auto"
-    """Repair symbols for each symbol sent from here (robot: requests, cloud: answers). With them, lost datagrams cost
-    no round trip.
+    """Number of repair symbols for each symbol that this sidecar sends. It applies to requests on a robot, and to
+    answers on a cloud. A symbol is the part of a message that one datagram carries. A repair symbol replaces a lost
+    symbol without another round trip.
 
-    - `auto` adds nothing while no loss is measured. It adds about 11 % to a message of 150 kB at 2 % loss, 17 % at 5 %,
-      and at most half.
-    - `off` adds nothing; what is lost is sent again.
+    - `auto`: no repair symbols while no loss is measured. A message of 150 kB gets about 11 % more at 2 % loss, and 17
+      % more at 5 % loss. It gets at most half more.
+    - `off`: no repair symbols. Lost datagrams are sent again.
+    - A number: always this share.
 
-    From 0.5 % loss on, some datagrams are sent twice, also with `off`: those that no repair symbol covers and whose
-    further loss would cost another round trip. These are a message's last datagram (all of a one-datagram message) and
-    the few that are sent again."""
+    From 0.5 % loss on, the sidecar sends some datagrams twice, also with `off`. No repair symbol covers these
+    datagrams, and a further loss would cost another round trip. They are the last datagram of a message (the only one
+    of a short message), and the few datagrams that are sent again."""
     priority: Annotated[PriorityWord, converted, _ROBOT] = PriorityWord.NORMAL
-    """Requests and answers of a service with a higher priority go before those of a lower one: on the robot's paths, on
-    the way back and in the server's queue. Use `high` for small and urgent requests, `low` for bulk that may wait."""
+    """Requests and answers of a service with a higher priority go before those with a lower one. This holds on the
+    robot's paths, on the way back, and in the server's queue. Use `high` for small, urgent requests. Use `low` for bulk
+    data that may wait."""
     redundancy: Annotated[RedundancyMode, converted, _ROBOT] = RedundancyMode.REPLICATE
-    """Which of the mapped pairs of interface and server carry a copy.
+    """Which of the mapped pairs carry a copy of a request. A pair is an interface and a server. The control plane maps
+    the pairs of each service.
 
     - `single`: the best pair.
-    - `backup`: also the next one, as soon as the best one's path is unstable or down, or loses the request.
-    - `hedge`: also the next one when the answer takes long; idempotent services only.
-    - `adaptive`: others as well, as late as `target_miss` allows given the progress of the first copy; idempotent
-      services only.
-    - `share`: all mapped interfaces carry one copy together, to one server, each as much as it can; spare capacity
-      repeats what the others carry.
-    - `replicate`: all at once; `copies` says how many are mapped."""
+    - `backup`: the best pair. The next pair follows as soon as the path of the best one is unstable or down, or loses
+      the request.
+    - `hedge`: the best pair. The next pair follows when the answer takes long. Only for idempotent services.
+    - `adaptive`: one pair. Others follow if the progress of the first copy endangers the deadline, as late as
+      `target_miss` allows. Only for idempotent services.
+    - `share`: all mapped interfaces together carry one copy to one server. Each carries as much as it can. Spare
+      capacity repeats what other interfaces carry.
+    - `replicate`: all pairs at once. `copies` sets how many interfaces are mapped."""
     hedge_quantile: Annotated[float, Field(ge=MIN_HEDGE_QUANTILE, le=MAX_HEDGE_QUANTILE), _ROBOT] = (
         DEFAULT_HEDGE_QUANTILE
     )
     """With `redundancy: hedge` only. The next copy is sent when the answer takes longer than this share of the recent
-    answers over that pair, at half the deadline at the latest."""
+    answers over the same pair. It is sent at half of the deadline at the latest."""
     repeats: Annotated[float, Field(ge=0, le=1), _ROBOT] = DEFAULT_REPEATS
-    """With `redundancy: share` only. Interfaces with capacity to spare repeat up to this share of a request that others
-    carry. With 1, an interface that goes dark costs no time. With 0, nothing travels twice, and what such an interface
-    carried is missing until that is noticed."""
+    """With `redundancy: share` only. Interfaces with spare capacity repeat up to this share of the request that other
+    interfaces carry. With 1, an interface that fails costs no time. With 0, nothing is sent twice. If an interface then
+    fails, its part of the request is missing until the sidecar notices the failure."""
     copies: Annotated[CopiesWanted | None, _ROBOT] = None
     """Over how many interfaces the control plane maps copies of a request.
 
-    - `each`: over all. This is the default.
-    - `at_most`: over all, but over none rather than one too many for a server, or one into a region or behind a carrier
-      that has one already. This is the default with `mode: cheapest`.
-    - A number: over that many, the best ones."""
+    - `each`: over all interfaces. This is the default.
+    - `at_most`: over all interfaces, with exceptions. An interface is left out if its copy would exceed the capacity of
+      a server. It is also left out if its copy would go into a region, or behind a carrier, that already has a copy.
+      This is the default with `mode: cheapest`.
+    - A number: over this many interfaces, the best ones."""
     mode: Annotated[ModeWord, converted, _ROBOT] = ModeWord.MOST_RELIABLE
     """Aim of the mapping.
 
     - `most_reliable`: to miss as few deadlines as possible.
     - `cheapest`: to cost as little as possible while `target_miss` is kept."""
     target_miss: Annotated[float | None, Field(gt=0, lt=1), _ROBOT] = None
-    """The largest predicted probability that a request misses its deadline. The key needs `mode: cheapest` or
+    """The largest predicted probability that a request misses its deadline. The key requires `mode: cheapest` or
     `redundancy: adaptive`.
 
-    - With `mode: cheapest` the mapping keeps it. The key is required.
-    - With `redundancy: adaptive` the moment at which further copies are sent keeps it. The default is 0.001."""
+    - With `mode: cheapest`, the key is required. The control plane takes the cheapest mapping that keeps the target.
+    - With `redundancy: adaptive`, the default is 0.001. The sidecar sends further copies early enough to keep the
+      target."""
     exploration: Annotated[float, Field(ge=0, le=MAX_EXPLORATION), _ROBOT] = DEFAULT_EXPLORATION
-    """At most this share of the requests gets one more copy, over a pair of interface and server about which too little
-    is known: `redundancy` or a budget leaves that pair out, or (idempotent services) the mapping does not use it. There
-    are at most 12 such copies a minute, none of requests beyond 128 KiB or over a busy interface. `0` turns this off;
-    only idempotent services may set another value."""
+    """The largest share of the requests that get one extra copy to measure a pair of interface and server. The measured
+    pair is one that `redundancy` or a budget leaves out, and about which too little is known. For an idempotent
+    service, it may also be a pair outside the mapping. A service sends at most 12 such copies a minute. Requests above
+    128 KiB and busy interfaces are excluded. `0` turns this off. Only an idempotent service may set another value."""
     fallback: Annotated[FullServiceName | None, _ROBOT] = None
-    """Full name of a service of the same type, served by a node on this robot, that answers when the network does not.
-    The first answer wins. The key needs the full name of one service with `idempotent: true`. A fallback is never
-    carried itself, whatever glob matches it."""
+    """Full name of a service that answers when the network does not. A node on this robot serves it, with the same
+    type. The first answer wins. The key requires a full name in `name`, and `idempotent: true`. The sidecar never
+    carries the fallback service itself, even if a glob matches it."""
     fallback_start: Annotated[FallbackStart, converted, _ROBOT] = FallbackStart.IN_TIME
-    """When the fallback is asked. Both values: at once when the network has refused.
+    """When the sidecar asks the fallback. With both values, it asks at once when the network has refused the request.
 
-    - `in_time`: early enough to answer by the deadline, and at once while no path is up.
+    - `in_time`: early enough for an answer by the deadline, and at once while no path is up.
     - `on_miss`: when the network has missed the deadline."""
     fallback_takes_ms: Annotated[float | None, Field(gt=0, le=MAX_DEADLINE_MS), _ROBOT] = None
-    """With `fallback_start: in_time` only. The longest time that the fallback takes for a request, less than 95 % of
-    `deadline_ms`. Without this key the sidecar measures it."""
+    """With `fallback_start: in_time` only. The longest time that the fallback takes for a request. It must be less than
+    95 % of `deadline_ms`. Without this key, the sidecar measures the time."""
     capacity_interfaces: Annotated[
         int | None, Field(ge=1, le=1_000_000), OnlyOn(Role.CLOUD, "it limits what that server takes")
     ] = None
-    """How many interfaces of all robots together the control plane may map to this server for the service. The limit is
-    exceeded, and reported, when there is no other way. Without this key there is none."""
+    """How many interfaces of all robots together the control plane may map to this server for the service. If there is
+    no other way, the control plane exceeds the limit and reports it. Without this key, there is no limit."""
     cost_per_request: Annotated[
         float, Field(ge=0, le=MAX_COST_PER_REQUEST), OnlyOn(Role.CLOUD, "a robot's costs are its networks'")
     ] = 0.0
-    """Cost of a request that this server runs, in the currency of the robots' networks. It counts for robots' services
-    with `mode: cheapest`."""
+    """Cost of a request that this server runs, in the same currency as the costs of the robots' networks. It counts for
+    robots' services with `mode: cheapest`."""
 
     @model_validator(mode="before")
     @classmethod

@@ -67,10 +67,10 @@ class StunConfig(Section):
     """How the sidecar learns its addresses as seen from outside."""
 
     enabled: bool = True
-    """Turn it off only where no NAT lies between the sidecars, such as clouds with public addresses."""
+    """Set `false` only if no NAT lies between the sidecars, as between clouds with public addresses."""
     servers: Annotated[tuple[RemoteAddress, ...], AfterValidator(refuse_duplicates), converted] = ()
-    """STUN servers to ask. An empty list: those named by the control plane, else port 3478 of the control plane's
-    host."""
+    """STUN servers to ask. If the list is empty, the sidecar asks those that the control plane names. If the control
+    plane names none, the sidecar asks port 3478 of the control plane's host."""
 
     @model_validator(mode="after")
     def _check(self) -> Self:
@@ -83,82 +83,86 @@ class AdvertisedAddress(Section):
     """A public address that a 1:1 NAT translates to one interface of a cloud."""
 
     address: IpAddress
-    """IPv4 or IPv6 without port: the NAT must keep `udp_port`."""
+    """IPv4 or IPv6 address without a port. The NAT must keep `udp_port`."""
     interface: Annotated[InterfacePattern, text_of("name")] | None = None
-    """Name of the interface behind that address. Without this key it is the first usable one."""
+    """Name of the interface behind that address. Without this key, it is the first usable interface."""
 
 
 class SidecarConfig(Section):
     """Configuration of plr-sidecar."""
 
     name: SidecarName
-    """Name of this sidecar, unique in the mesh. With `tls_dir` the certificate contains it, and it may be left out
-    here. The control plane refuses a second holder. Labels of metrics and `plr status` show it."""
+    """Name of this sidecar. It must be unique among all sidecars of the control plane, which refuses a second holder.
+    With `tls_dir`, the certificate contains the name, and you may leave this key out. `plr status` and the labels of
+    metrics show the name."""
     role: Annotated[Role, converted]
-    """What this host does. With `tls_dir` the certificate contains it, and it may be left out here.
+    """What this host does. With `tls_dir`, the certificate contains the role, and you may leave this key out.
 
     - `robot`: its applications call services.
     - `cloud`: its servers answer them."""
     control_plane: ControlPlaneAddresses
-    """Where the control plane listens for gRPC. IPv6 is written in brackets. Every address is tried over every
-    interface in use, and the first that answers is taken. An IP address needs no name server, which may lie behind a
-    dark carrier."""
+    """Where the control plane serves gRPC. Write an IPv6 address in brackets. The sidecar tries every address over
+    every interface in use, and takes the first that answers. An IP address works even if the name server is out of
+    reach."""
     tls_dir: Annotated[TlsDir, converted] | None = None
-    """Required without `insecure`. Folder with `cert.pem`, `key.pem`, `ca.pem` and perhaps `crl.pem`, as
-    `plr ca issue NAME --role robot` (or `cloud`) writes it. It is checked once a second: with a new certificate the
-    sidecar opens a new stream, and requests go on meanwhile."""
+    """Required without `insecure`. Folder with `cert.pem`, `key.pem`, `ca.pem` and perhaps `crl.pem`.
+    `plr ca issue NAME --role robot` (or `--role cloud`) writes it. The sidecar checks the folder once a second. With a
+    new certificate it opens a new stream to the control plane, and requests continue meanwhile."""
     insecure: bool = False
-    """`true` in place of `tls_dir`: everybody is who they say, and anyone in between may read and change the traffic.
-    This is for trials on one machine: a `control_plane` on another host is refused unless `--insecure-i-know` is on the
-    command line."""
+    """`true` in place of `tls_dir` turns certificates off. Every sidecar can then claim any name, and anyone on the
+    network can read and change the traffic. Use it only for trials on one machine. The sidecar then refuses a
+    `control_plane` on another host, unless the command line contains `--insecure-i-know`."""
     services: Annotated[tuple[ServiceConfig, ...], Field(min_length=1), converted]
-    """What is carried, and nothing else. The first entry that matches a name decides."""
+    """The services that the sidecar carries. It carries no others. The first entry that matches a service's name
+    applies."""
     interfaces: (
         Annotated[tuple[InterfacePattern, ...], Field(min_length=1), AfterValidator(refuse_duplicates), converted]
         | None
     ) = None
-    """Interfaces to use. Without this key: every ordinary interface that is up and has a carrier and an address.
-    Loopback, containers, bridges, VPNs and tunnels are used only under their exact name, never by a glob. An exact name
-    that does not exist causes a warning; the interface is used as soon as it comes."""
+    """Interfaces to use. Without this key, the sidecar uses every ordinary interface that is up, has a link and has an
+    address. Loopback, containers, bridges, VPNs and tunnels are used only under their exact name. A glob never matches
+    them. If an exact name does not exist, the sidecar logs a warning. It uses the interface as soon as it appears."""
     networks: Annotated[
         tuple[NetworkConfig, ...],
         converted,
         OnlyOn(Role.ROBOT, "it is the robots' interfaces that are chosen between"),
     ] = ()
-    """The networks behind the interfaces. The first entry that matches a name decides."""
+    """The networks behind the interfaces. The first entry that matches an interface's name applies."""
     region: Annotated[DomainLabel | None, OnlyOn(Role.CLOUD, "a robot's copies should go to different regions")] = None
-    """Where the cloud is. Copies of a request go to different regions where possible: clouds in the same region are
-    assumed to fail together."""
+    """Where the cloud is. Copies of a request go to different regions where possible. The control plane assumes that
+    clouds in the same region fail together."""
     udp_port: Annotated[int, Field(ge=0, le=65535)] = Field(
         default_factory=lambda fields: DEFAULT_CLOUD_UDP_PORT if fields.get("role") is Role.CLOUD else 0
     )
-    """Port of the data sockets, the same on every interface. `0` takes a free one. The default is 0 on a robot, 24700
-    on a cloud."""
+    """UDP port of the data sockets, the same on every interface. `0` takes a free port. The default is 0 on a robot and
+    24700 on a cloud."""
     advertise: Annotated[
         tuple[AdvertisedAddress, ...], converted, OnlyOn(Role.CLOUD, "a robot's addresses come from STUN")
     ] = ()
-    """Public addresses of a 1:1 NAT in front of this host. They need a fixed `udp_port`."""
+    """Public addresses of a 1:1 NAT in front of this host. This key requires a fixed `udp_port`."""
     stun: StunConfig = StunConfig()
     """How the sidecar learns its addresses as seen from outside."""
     state_dir: Annotated[AbsolutePath, converted] = Path("/var/lib/plr")
-    """Folder for the sidecar's identity and the last good peers and mapping. Each sidecar has its own; it is made if
-    missing. The folder, the folders above it and links on the way must belong to root or the sidecar's user. If the
-    folder is lost, the sidecar cannot start without a control plane, and cannot have its name until the old lease
-    ends."""
+    """Folder for the sidecar's identity, and for the last good peers and mapping. Each sidecar needs its own folder.
+    The sidecar creates a missing folder. The folder, the folders above it, and symbolic links in its path must belong
+    to root or to the sidecar's user. If the folder is lost, the sidecar cannot start without a control plane. It cannot
+    register its name either until the old lease ends."""
     max_revocation_age_s: Annotated[int | None, Field(ge=60, le=365 * 86_400)] = None
-    """The sidecar does not talk to peers whose CA signed no revocation list in this time, as far as is known here and
-    by this clock. This needs `tls_dir`. Without this key a list does not age."""
+    """Maximum age of a CA's newest revocation list. The sidecar does not talk to peers whose CA has signed no list
+    within this time. It judges by the lists that it has received, and by its own clock. This key requires `tls_dir`.
+    Without this key, revocation lists do not age."""
     rekey_after_s: Annotated[int, Field(ge=1, le=86_400)] = 120
-    """Age at which a path's ends agree on new keys. They also do so after 2^21 datagrams. The robot's value counts.
-    Nothing waits for it."""
+    """Age of a path's keys at which both ends agree on new keys. They also do so after 2^21 datagrams. The robot's
+    value applies. No traffic waits for new keys."""
     metrics_listen: ListenAddress | None = "127.0.0.1:9464"
-    """Where Prometheus reads the metrics; `null` for none."""
+    """Where Prometheus reads the metrics. `null` turns this off."""
     local_socket: LocalSocket | None = "auto"
-    """Unix socket that `plr doctor` and `plr ping` ask, 101 bytes at most; `null` for none. Root and the sidecar's user
-    may use it; the group `plr` uses the same path with `.group` at its end. `auto` is `sidecar.sock` in the unit's
-    runtime folder (`/run/plr`), or in `state_dir` where systemd does not start the sidecar."""
+    """Unix socket that `plr doctor` and `plr ping` ask. The path has 101 bytes at most. `null` turns the socket off.
+    Root and the sidecar's user may use the socket. Members of the group `plr` use a second socket at the same path with
+    `.group` at its end. `auto` means `sidecar.sock` in the runtime folder of the systemd unit (`/run/plr`). If systemd
+    does not start the sidecar, `auto` means `sidecar.sock` in `state_dir`."""
     log_level: Annotated[LogLevel, converted] = LogLevel.INFO
-    """Least level of what is logged to stderr."""
+    """Lowest level that is logged to stderr."""
 
     @model_validator(mode="after")
     def _secured_or_not(self) -> Self:
