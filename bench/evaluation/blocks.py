@@ -28,7 +28,7 @@ LIKE = {
     "mptcp": "`mptcp`: the kernel's multipath TCP",
     "zenoh": "`zenoh` over both, first reply",
     "zenoh-drop": "`zenoh-drop`: the same, dropping what finds its queue full",
-    "oracle": "`oracle`: knows the trace, shares each request out over both paths",
+    "oracle": "`oracle`: knows the trace, splits each request between both paths",
     "ideal": "`ideal`, no bound: the faster of two first-in-first-out paths for each request",
 }
 _NOTHING: Content = {}
@@ -184,10 +184,11 @@ def _measured(content: Content) -> str:
     on = "".join(f", {key}: {value}" for key, value in machine.items())
     commits = ", ".join(measured["commits"]) or "not recorded"
     files = "[Summary with charts](results/evaluation.md), [every figure](results/evaluation.json)"
-    runs_of = f"{measured['runs']} runs in {len(runs)} windows, {void} of them void"
-    computed = f"{recorded - measured['runs']} more that are computed from the traces"
-    when = f"Measured from {measured['from']} to {measured['to']}, the newest on{on.removeprefix(',')}"
-    return f"{runs_of}, and {computed}. {when}. Commit: {commits}. {files}."
+    runs_of = f"{measured['runs']} runs in {len(runs)} windows were measured, {void} of them void"
+    computed = f"{recorded - measured['runs']} more runs are computed from the traces"
+    when = f"The measurement lasted from {measured['from']} to {measured['to']}"
+    where = f"The newest run was made on this machine:{on.removeprefix(',')}"
+    return f"{runs_of}. {computed}. {when}. {where}. Commit: {commits}. {files}."
 
 
 def _verdicts(content: Content) -> str:
