@@ -10,7 +10,7 @@ again.
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from plr.controlplane.core.formulation.block import BlockNotes, Picture, draw_block, interfaces_of
 from plr.controlplane.core.policy.path_rules import PathRules
@@ -28,6 +28,9 @@ if TYPE_CHECKING:
     from plr.protos.model.ids import InterfaceName, NodeName, ServiceName
     from plr.protos.model.members import InterfaceLabel, Registration, ServiceOffer, ServiceUse
     from plr.protos.model.report import Report
+
+    _Way = tuple[tuple[InterfaceName, ...], frozenset[tuple[InterfaceName, NodeName]]]
+    """Interfaces, and barred pairs of them and clouds."""
 
 SLICE_PAIRS = 40
 """Pairs (interface, server) estimated at a time: some milliseconds, for which streams wait."""
@@ -47,7 +50,7 @@ LEAST_INTERFACES = 16
 """... but not fewer than these."""
 
 LOOKED_AT_ONCE = 200
-"""Robots checked in one go for who could serve them: some milliseconds."""
+"""Uses, or robots without any, checked in one go for who could serve them: some milliseconds."""
 
 FEW_ROBOTS = 16
 """Up to this many robots to be drawn at once are all re-estimated; of more, only those that have to be."""
@@ -380,7 +383,7 @@ class Drawing:
         For unchanged robots, while clouds and policy are unchanged, earlier results hold. So an interruption by the
         next change does not lose the progress.
         """
-        clouds: dict[tuple[ServiceName, str], list[Sidecar]] = {}
+        clouds: dict[tuple[ServiceName, str], list[_Offered]] = {}
         fleet_capacity: dict[FleetKey, int] = {}
         robots: list[Sidecar] = []
         around: list[object] = [permits]
@@ -392,13 +395,13 @@ class Drawing:
                 continue
             around.append((sidecar.registration, sidecar.services, sidecar.offered))
             for offer in sidecar.offers:
-                clouds.setdefault((offer.name, offer.type), []).append(sidecar)
+                clouds.setdefault((offer.name, offer.type), []).append(_Offered(sidecar, offer))
                 if offer.capacity:
                     fleet_capacity[FleetKey(sidecar.name, offer.name)] = offer.capacity
         if around != self._around:
             self._around = around
             self._looked_at.clear()
-        callable_by: dict[tuple[Group, ServiceName, str], tuple[Sidecar, ...]] = {}
+        callable_by: dict[tuple[Group, ServiceName, str], tuple[_Offered, ...]] = {}
         uses: dict[NodeName, tuple[tuple[BlockKey, _Inputs], ...]] = {}
         looked_at = 0
         for robot in robots:
@@ -407,22 +410,25 @@ class Drawing:
                 uses[robot.name] = known.uses
                 continue
             group = permits.group(robot.name)
+            ways = _Ways(robot, self._path_rules)
             found = []
             for use in robot.uses:
                 kind = group, use.name, use.type
-                offering = clouds.get((use.name, use.type), [])
+                offered = clouds.get((use.name, use.type), [])
                 if kind not in callable_by:
-                    callable_by[kind] = tuple(cloud for cloud in offering if use.name in permits.of(group, cloud))
-                found.append(
-                    (BlockKey(robot.name, use.name), _inputs(robot, use, offering, callable_by[kind], self._path_rules))
-                )
+                    callable_by[kind] = tuple(one for one in offered if use.name in permits.of(group, one.cloud))
+                found.append((BlockKey(robot.name, use.name), _inputs(ways, use, offered, callable_by[kind])))
+                looked_at += 1
+                if looked_at % LOOKED_AT_ONCE == 0:
+                    yield
             uses[robot.name] = tuple(found)
             self._looked_at[robot.name] = _LookedAt(robot, uses[robot.name])
             if any(key not in self._drawn or self._drawn[key].inputs != inputs for key, inputs in found):
                 self.robot_changed(robot.name, estimate_again=False)
-            looked_at += 1
-            if looked_at % LOOKED_AT_ONCE == 0:
-                yield
+            if not found:
+                looked_at += 1
+                if looked_at % LOOKED_AT_ONCE == 0:
+                    yield
         self._forget_others(uses)
         self._frame = _Frame(uses, fleet_capacity)
 
@@ -479,18 +485,40 @@ class Drawing:
         self._drawn[key] = _Drawn(inputs, block, notes)
 
 
-def _inputs(
-    robot: Sidecar,
-    use: ServiceUse,
-    offering: Sequence[Sidecar],
-    clouds: tuple[Sidecar, ...],
-    path_rules: PathRules,
-) -> _Inputs:
-    """Return the inputs of a use: of those `offering` the service, the robot may call it on `clouds`."""
-    interfaces = interfaces_of(robot)[
-        : max(LEAST_INTERFACES, min(MAX_CONSIDERED_INTERFACES, USE_PAIRS // max(1, len(clouds))))
-    ]
-    barred = path_rules.barred(robot.name, interfaces, [cloud.name for cloud in clouds])
+class _Offered(NamedTuple):
+    """A service that a cloud offers."""
+
+    cloud: Sidecar
+    offer: ServiceOffer
+
+
+class _Ways:
+    """Which interfaces of a robot lead where; its uses share this."""
+
+    def __init__(self, robot: Sidecar, path_rules: PathRules) -> None:
+        self.robot = robot
+        self._interfaces = interfaces_of(robot)
+        self._path_rules = path_rules
+        self._about = path_rules.about(robot.name)
+        self._to: dict[tuple[NodeName, ...], _Way] = {}
+        """By the names of clouds."""
+
+    def to(self, clouds: Sequence[Sidecar]) -> _Way:
+        """Return the interfaces considered for these clouds, and which pairs the path rules bar."""
+        names = tuple(cloud.name for cloud in clouds)
+        way = self._to.get(names)
+        if way is None:
+            most = max(LEAST_INTERFACES, min(MAX_CONSIDERED_INTERFACES, USE_PAIRS // max(1, len(names))))
+            interfaces = self._interfaces[:most]
+            way = self._to[names] = interfaces, self._path_rules.barred(self._about, interfaces, names)
+        return way
+
+
+def _inputs(ways: _Ways, use: ServiceUse, offering: Sequence[_Offered], may_call: Sequence[_Offered]) -> _Inputs:
+    """Return the inputs of a use: of those `offering` the service, `may_call` are those that the robot may call."""
+    robot = ways.robot
+    clouds = tuple(one.cloud for one in may_call)
+    interfaces, barred = ways.to(clouds)
     if not offering:
         unserved = f"no live server offers it as {use.type}"
     elif not clouds:
@@ -501,7 +529,7 @@ def _inputs(
         unserved = "the path rules let this robot use no path to a live server"
     else:
         unserved = ""
-    offers = tuple((cloud.registration, offer) for cloud in clouds for offer in cloud.offers if offer.name == use.name)
+    offers = tuple((one.cloud.registration, one.offer) for one in may_call)
     return _Inputs(interfaces, robot.labels, use, offers, barred, unserved, robot, clouds)
 
 

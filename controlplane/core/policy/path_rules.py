@@ -41,11 +41,14 @@ class PathRules:
         self._robots = PatternIndex(rule.robots for rule in self._rules)
         self._verdicts: dict[tuple[frozenset[int], InterfaceName, NodeName], bool] = {}
 
+    def about(self, robot: NodeName) -> frozenset[int]:
+        """Return the numbers of the rules that may match the robot."""
+        return self._robots.matching(robot) if self._rules else frozenset()
+
     def barred(
-        self, robot: NodeName, interfaces: Iterable[InterfaceName], clouds: Collection[NodeName]
+        self, about: frozenset[int], interfaces: Iterable[InterfaceName], clouds: Collection[NodeName]
     ) -> frozenset[tuple[InterfaceName, NodeName]]:
-        """Return which of these pairs the robot's mappings may not use."""
-        about = self._robots.matching(robot) if self._rules else frozenset[int]()
+        """Return which of these pairs may not be used by the mappings of a robot that these rules are `about`."""
         if not about:
             return frozenset()
         pairs = ((interface, cloud) for interface in interfaces for cloud in clouds)

@@ -26,12 +26,13 @@ from plr.controlplane.core.formulation.problem_builder import (
     Drawing,
     is_alike,
 )
+from plr.controlplane.core.policy.path_rules import PathRule, PathRules
 from plr.controlplane.core.policy.permits import Permits
 from plr.controlplane.core.policy.policy import CallRule, OfferRule, Policy
 from plr.controlplane.core.problem.problem import Block, BlockKey, Objective
 from plr.controlplane.core.registry.registry import Sidecar
 from plr.protos.model.ids import InterfaceName, NodeName, Role, ServiceName
-from plr.protos.model.members import InterfaceLabel, ServiceSet
+from plr.protos.model.members import InterfaceLabel, ServiceOffer, ServiceSet
 from plr.protos.model.report import Report
 from tests.support.samples import PLAN, histogram, interfaces, latency, offer, path, registration, stream, use
 
@@ -384,9 +385,9 @@ def test_a_change_of_one_robot_lets_the_others_be(monkeypatch: pytest.MonkeyPatc
     looked_at = []
     inputs = problem_builder._inputs
 
-    def counted(robot: Sidecar, *rest: Any) -> problem_builder._Inputs:
-        looked_at.append(robot.name)
-        return inputs(robot, *rest)
+    def counted(ways: problem_builder._Ways, *rest: Any) -> problem_builder._Inputs:
+        looked_at.append(ways.robot.name)
+        return inputs(ways, *rest)
 
     monkeypatch.setattr(problem_builder, "_inputs", counted)
     fleet.sidecars[7] = replace(fleet.sidecars[7], candidates=interfaces("wlan0"))
@@ -417,6 +418,51 @@ def test_a_large_fleet_is_looked_at_in_several_goes() -> None:
     assert {note.unserved for note in fleet.drawing.picture().notes.values()} == {
         "the access policy lets this robot call it on no live server"
     }
+
+
+@pytest.mark.audit("ops-19")
+def test_many_services_are_looked_at_in_several_goes_and_each_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    services, interfaces_named = 3 * problem_builder.LOOKED_AT_ONCE, 100
+    names = [ServiceName(f"/service_{number}") for number in range(services)]
+    fleet = Fleet(1)
+    fleet.drawing = Drawing(
+        default_capacity_interfaces=1,
+        objective=Objective.JOINT,
+        path_rules=[PathRule(("*",), ("wlan9*",), ("*",), allow=False)],
+    )
+    fleet.sidecars[:2] = [
+        replace(cloud, services=ServiceSet(tuple(offer(name) for name in names))) for cloud in fleet.sidecars[:2]
+    ]
+    fleet.sidecars[2] = replace(
+        fleet.sidecars[2],
+        candidates=interfaces(*(f"wlan{number}" for number in range(interfaces_named))),
+        services=ServiceSet((), tuple(use(name) for name in names)),
+    )
+    offers_read, verdicts, reads = 0, 0, Sidecar.offers.fget  # type: ignore[attr-defined]
+    allows = PathRules._allows
+
+    def offers(sidecar: Sidecar) -> tuple[ServiceOffer, ...]:
+        nonlocal offers_read
+        offers_read += 1
+        found: tuple[ServiceOffer, ...] = reads(sidecar)
+        return found
+
+    def counted(rules: PathRules, *pair: Any) -> bool:
+        nonlocal verdicts
+        verdicts += 1
+        return allows(rules, *pair)
+
+    monkeypatch.setattr(Sidecar, "offers", property(offers))
+    monkeypatch.setattr(PathRules, "_allows", counted)
+    fleet.drawing.begin(routine=False)
+    for _ in range(services // problem_builder.LOOKED_AT_ONCE):
+        assert not fleet.drawing.advance(fleet.sidecars, fleet.permits, fleet.estimator, fleet.now)
+        assert fleet.drawing._frame is None
+    assert not fleet.drawing.advance(fleet.sidecars, fleet.permits, fleet.estimator, fleet.now)
+    assert fleet.drawing._frame is not None
+    assert len(fleet.drawing._frame.uses[fleet.names[0]]) == services
+    assert offers_read <= len(fleet.sidecars), "once for each cloud, not for each use"
+    assert verdicts <= 2 * interfaces_named, "once for each path, not for each use"
 
 
 # ── a robot with much to draw ──
