@@ -15,7 +15,7 @@ import prometheus_client
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily
 
 from plr.controlplane.observe.fleet_metrics import FleetCollector
-from plr.controlplane.serve import handshakes, stream_limits, tls_gate
+from plr.controlplane.serve import access, handshakes, stream_limits, tls_gate
 from plr.protos.model.fleet_events import EventLogState
 from plr.protos.model.ids import Role
 from plr.protos.model.status import SyncState
@@ -65,6 +65,7 @@ REFUSAL_REASONS = (
     tls_gate.GAVE_UP,
     stream_limits.TOO_MANY_STREAMS,
     stream_limits.TOO_FAST,
+    access.TOO_MANY_CALLS,
 )
 """Labels of plr_refused_connections_total, present from the start."""
 

@@ -1,12 +1,16 @@
-"""Decides which role may call what on the gRPC port, and refuses everything else before any service sees it."""
+"""Decides which role may call what on the gRPC port, and how often; nothing else reaches a service."""
 
 from __future__ import annotations
 
+import asyncio
 import inspect
+import time
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import grpc
 
+from plr.controlplane.core.base.member_table import MemberTable
 from plr.protos.program.certificate_term import with_remedy
 from plr.protos.trust.identity import WRONG_ROLE, IdentityRole
 
@@ -28,12 +32,49 @@ _ALLOWED = {
 """Service -> roles; a service that is missing here may be called by nobody."""
 
 
+TOO_MANY_CALLS = "too_many_calls"
+
+CALLS_PER_S = 20.0
+"""Calls of one name, whatever they call: a sidecar makes one when it connects, an operator a few at a time."""
+
+CALLS_BURST = 100.0
+"""Calls of one name that are answered at once."""
+
+LONGEST_WAIT_S = 10.0
+"""A call that would have to wait for longer is refused."""
+
+
+@dataclass(slots=True)
+class _Turns:
+    """When one name's calls have their turns (the generic cell rate algorithm, ITU-T I.371)."""
+
+    next_at: float
+
+
+class CallRates:
+    """Gives each name's calls their turns. Times are monotonic seconds."""
+
+    def __init__(self) -> None:
+        self._turns = MemberTable(_Turns)
+
+    def take_turn(self, name: str, now: float) -> float | None:
+        """Return for how long (s) this call has to wait; None if that is too long, and the call is to be refused."""
+        turns = self._turns.of(name, now)
+        next_at = max(turns.next_at, now)
+        wait_s = max(0.0, next_at - now - (CALLS_BURST - 1.0) / CALLS_PER_S)
+        if wait_s > LONGEST_WAIT_S:
+            return None
+        turns.next_at = next_at + 1.0 / CALLS_PER_S
+        return wait_s
+
+
 class AccessGuard(grpc.aio.ServerInterceptor):
     """Asks `caller` who is behind the peer of each call; passes the reason of each refusal to `on_refused`."""
 
     def __init__(self, caller: Callable[[str], Caller | None], on_refused: Callable[[str], None]) -> None:
         self._caller = caller
         self._on_refused = on_refused
+        self._rates = CallRates()
 
     async def intercept_service(
         self,
@@ -62,6 +103,18 @@ class AccessGuard(grpc.aio.ServerInterceptor):
                 grpc.StatusCode.PERMISSION_DENIED,
                 f"the certificate of {name} has the role {role}, which may not use {service}",
             )
+        else:
+            await self._wait_for_turn(caller.identity.name, context)
+
+    async def _wait_for_turn(self, name: str, context: Any) -> None:
+        """Hold back a call of a name that calls too often. A held call costs next to nothing, a refused one returns."""
+        wait_s = self._rates.take_turn(name, time.monotonic())
+        if wait_s is None:
+            self._on_refused(TOO_MANY_CALLS)
+            text = f"{name} makes more than {CALLS_PER_S:g} calls a second: call less often"
+            await context.abort(grpc.StatusCode.RESOURCE_EXHAUSTED, text)
+        elif wait_s:
+            await asyncio.sleep(wait_s)
 
 
 def _wrap(handler: _Handler, admit: Callable[[Any], Awaitable[None]]) -> _Handler:

@@ -16,8 +16,9 @@ from plr.controlplane.serve.stream_limits import (
     MAX_STREAMS_PER_NAME,
     TOO_FAST,
     TOO_MANY_STREAMS,
+    MemberRates,
     StreamCount,
-    StreamRate,
+    announced_entries,
 )
 from plr.protos.base.errors import DecodeError, UnknownKindError
 from plr.protos.convert import (
@@ -98,9 +99,9 @@ class ControlPlaneService:
 
     def __init__(self, loop: ControlLoop, report_interval_s: float, gate: TlsGate | None) -> None:
         self._loop = loop
-        self._report_interval_s = report_interval_s
         self._gate = gate
         self._streams = StreamCount()
+        self._rates = MemberRates(report_interval_s=report_interval_s)
         self._turn = asyncio.Semaphore(REGISTERED_AT_ONCE)
         self._encoder = StreamEncoder()
 
@@ -190,13 +191,11 @@ class ControlPlaneService:
     async def _read(self, name: NodeName, stream: StreamId, context: Context) -> NoReturn:
         told = False
         malformed: str | None = None
-        rate = StreamRate(report_interval_s=self._report_interval_s, now=time.monotonic())
         shares = self._loop.report_shares
         while True:
             data = await self._receive(context)
-            if not rate.take(len(data), time.monotonic()):
-                self._loop.refused(TOO_FAST)
-                raise _StreamEndError(grpc.StatusCode.RESOURCE_EXHAUSTED, "messages arrive too fast")
+            if not self._rates.take(name, len(data), time.monotonic()):
+                raise self._too_fast("messages arrive too fast")
             try:
                 parts: list[SidecarMessage]
                 try:
@@ -204,6 +203,8 @@ class ControlPlaneService:
                 except UnknownKindError as error:
                     self._loop.unknown_message(name, str(error), again=told)
                     told, parts = True, [Heartbeat()]
+                if not self._rates.take_entries(name, sum(map(announced_entries, parts)), time.monotonic()):
+                    raise self._too_fast("large announcements arrive too fast")
                 if len(parts) == 1:
                     self._loop.receive(stream, parts[0])
                 else:
@@ -218,6 +219,10 @@ class ControlPlaneService:
             if entries and shares.take(name, entries, time.monotonic()):
                 while wait_s := shares.wait_s(name, time.monotonic()):  # noqa: ASYNC110 - the load may be over sooner
                     await asyncio.sleep(min(wait_s, LOOK_AGAIN_S))
+
+    def _too_fast(self, details: str) -> _StreamEndError:
+        self._loop.refused(TOO_FAST)
+        return _StreamEndError(grpc.StatusCode.RESOURCE_EXHAUSTED, details)
 
     async def _parse(self, data: bytes) -> list[SidecarMessage]:
         """Parse a message; a long report in parts, in turns with whatever else is due."""
