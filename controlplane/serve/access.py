@@ -41,7 +41,7 @@ CALLS_BURST = 100.0
 """Calls of one name that are answered at once."""
 
 LONGEST_WAIT_S = 10.0
-"""A call that would have to wait for longer is refused."""
+"""A call that would have to wait for longer is refused, after this time."""
 
 
 @dataclass(slots=True)
@@ -107,10 +107,14 @@ class AccessGuard(grpc.aio.ServerInterceptor):
             await self._wait_for_turn(caller.identity.name, context)
 
     async def _wait_for_turn(self, name: str, context: Any) -> None:
-        """Hold back a call of a name that calls too often. A held call costs next to nothing, a refused one returns."""
+        """Hold back a call of a name that calls too often, even if it is to be refused.
+
+        A held call costs next to nothing. Who is refused at once calls again at once.
+        """
         wait_s = self._rates.take_turn(name, time.monotonic())
         if wait_s is None:
             self._on_refused(TOO_MANY_CALLS)
+            await asyncio.sleep(LONGEST_WAIT_S)
             text = f"{name} makes more than {CALLS_PER_S:g} calls a second: call less often"
             await context.abort(grpc.StatusCode.RESOURCE_EXHAUSTED, text)
         elif wait_s:
