@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, NamedTuple
 from plr.sidecar.core.base.fair_share import FORGOTTEN_AT_ONCE, Shares
 from plr.sidecar.core.base.timers import first_of
 from plr.sidecar.core.base.values import ExecutionId, RejectReason, RequestId
-from plr.sidecar.core.cloud.answer_cache import AnswerCache
+from plr.sidecar.core.cloud.answer_budget import AnswerBudget
 from plr.sidecar.core.cloud.early_cancels import EarlyCancels
 from plr.sidecar.core.cloud.refused_copies import RefusedCopies, RefusedCopy
 from plr.sidecar.core.rules.service_rule import MAX_LIFETIME_S
@@ -141,7 +141,7 @@ class ExecutionTable:
         self._running_shares = Shares(MAX_RUNNING)
         self._running_bytes = Shares(MAX_RUNNING_BYTES)
         self._finished_shares = Shares(MAX_REMEMBERED_IDS)
-        self._cache = AnswerCache(MAX_CACHED_BYTES)
+        self._cache = AnswerBudget(MAX_CACHED_BYTES)
         self._timers: list[tuple[float, ExecutionId]] = []
         self._next_id = 0
         self._early_cancels = EarlyCancels(stats)

@@ -22,7 +22,7 @@ HEAP_SLACK = 1024
 """Outdated entries that may remain in the heap before it is built again."""
 
 
-class AnswerCache:
+class AnswerBudget:
     """Sizes of the kept answers, by robot and request; the answers themselves are the caller's."""
 
     __slots__ = ("_bytes", "_capacity", "_greediest", "_sizes", "held_bytes")

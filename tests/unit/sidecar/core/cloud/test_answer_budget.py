@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from plr.protos.model.ids import NodeName
-from plr.sidecar.core.cloud.answer_cache import EVICTED_AT_ONCE, HEAP_SLACK, AnswerCache
+from plr.sidecar.core.cloud.answer_budget import EVICTED_AT_ONCE, HEAP_SLACK, AnswerBudget
 from tests.support.builders import request_id
 
 ROBOTS = [NodeName(f"robot-{number}") for number in range(5)]
@@ -15,7 +15,7 @@ CAPACITY = 100
 
 @given(st.lists(st.tuples(st.sampled_from(ROBOTS), st.integers(0, 40), st.booleans()), max_size=200))
 def test_whoever_holds_the_most_loses_its_oldest(steps: list[tuple[NodeName, int, bool]]) -> None:
-    cache, kept = AnswerCache(CAPACITY), {robot: dict[int, int]() for robot in ROBOTS}
+    cache, kept = AnswerBudget(CAPACITY), {robot: dict[int, int]() for robot in ROBOTS}
     for number, (robot, size, removes) in enumerate(steps):
         if removes and kept[robot]:
             gone = next(iter(kept[robot]))
@@ -35,7 +35,7 @@ def test_whoever_holds_the_most_loses_its_oldest(steps: list[tuple[NodeName, int
 
 
 def test_a_large_answer_drives_out_many_small_ones_over_several_calls() -> None:
-    cache = AnswerCache(10 * EVICTED_AT_ONCE)
+    cache = AnswerBudget(10 * EVICTED_AT_ONCE)
     robot = ROBOTS[0]
     for number in range(10 * EVICTED_AT_ONCE):
         cache.add(robot, request_id(number), 1)
@@ -47,7 +47,7 @@ def test_a_large_answer_drives_out_many_small_ones_over_several_calls() -> None:
 
 
 def test_outdated_entries_do_not_pile_up() -> None:
-    cache, rng = AnswerCache(1000), random.Random(1)
+    cache, rng = AnswerBudget(1000), random.Random(1)
     for number in range(20 * HEAP_SLACK):
         cache.add(rng.choice(ROBOTS), request_id(number), 10)
     assert len(cache._greediest) <= 2 * len(ROBOTS) + HEAP_SLACK + 1
