@@ -243,7 +243,7 @@ def _modes(content: Content) -> str:
     found = content.get("redundancy_modes")
     if not found:
         return NOTHING
-    columns = ("`redundancy`", "windows", "missed", "of the misses that `replicate` avoids", "bytes beyond `single`")
+    columns = ("`redundancy`", "windows", "missed", "avoided misses (`replicate` = 100 %)", "bytes beyond `single`")
     rows = tuple(
         (
             f"`{name.removeprefix('plr-')}`",
