@@ -29,7 +29,7 @@ LIKE = {
     "zenoh": "`zenoh` over both, first reply",
     "zenoh-drop": "`zenoh-drop`: the same, dropping what finds its queue full",
     "oracle": "`oracle`: knows the trace, shares each request out over both paths",
-    "ideal": "`ideal`, no bound: the faster of two first-in-first-out paths for each request",
+    "ideal": "`ideal` (computed, not a bound): requests go over two first-in-first-out paths, the faster one counts",
 }
 _NOTHING: Content = {}
 
