@@ -29,7 +29,7 @@ LIKE = {
     "zenoh": "`zenoh` over both, first reply",
     "zenoh-drop": "`zenoh-drop`: the same, dropping what finds its queue full",
     "oracle": "`oracle`: knows the trace, splits each request between both paths",
-    "ideal": "`ideal`, no bound: the faster of two first-in-first-out paths for each request",
+    "ideal": "`ideal` (computed, not a bound): requests go over two first-in-first-out paths, the faster one counts",
 }
 _NOTHING: Content = {}
 
@@ -56,10 +56,14 @@ def _same_drives(content: Content, one: Mapping[str, Any]) -> str:
     windows, hard = one["windows"], one["hard_windows"]
     requests = next(iter(found.values()))["requests"]
     if windows == content["everywhere"][0]["windows"]:
-        about = f"All {len(windows)} windows of recorded drives, {requests} requests each{_distinct(content)}."
+        about = (
+            f"Every row covers all {len(windows)} windows of recorded drives, {requests} requests together. "
+            f"{_distinct(content)}"
+        )
     else:
         about = f"Every mode ran in {len(windows)} windows. In {hard} of them, a direct run misses a request."
-    columns = ("", "missed", "each drive alike", "never answered", "mean", "P50", "P99", "P99, median window", "kB")
+    shares = ("missed", "missed, each drive with equal weight", "never answered")
+    columns = ("", *shares, "mean", "P50", "P99", "P99, median of the windows", "kB a request")
     rows = tuple(
         (
             _label(name),
@@ -89,8 +93,8 @@ def _beside_oracle(found: Mapping[str, Mapping[str, Any]]) -> str:
     ours, least = (found[name]["miss_ratio"] for name in (SUREST, ORACLE))
     times = f" This is {least / ours * 100:.0f} % of what `{SUREST}` misses." if ours else ""
     return (
-        f"\nAn oracle that knows what each path will carry, and splits every request between both paths, misses "
-        f"{_percent(least)}.{times}"
+        "\nThe oracle is computed. It knows what each path will carry, and splits every request between both paths. "
+        f"It misses {_percent(least)}.{times}"
     )
 
 
@@ -122,10 +126,11 @@ def _distinct_drives(content: Content) -> str:
 def _distinct(content: Content) -> str:
     drives = content.get("drives")
     if drives is None:
-        return "; which of them are one drive was not looked at"
+        return "Which of them are one drive was not looked at."
     count, recordings = len(drives["distinct"]), drives["recordings"]
     return (
-        f"; only {count} of them are distinct drives, from {recordings} recordings (the others replay the same seconds)"
+        f"Only {count} of the windows are distinct drives, from {recordings} recordings. The others replay seconds of "
+        "these drives."
     )
 
 
@@ -148,7 +153,7 @@ def _others(content: Content) -> str:
     found = content.get("others")
     if not found:
         return NOTHING
-    columns = ("", "windows", "missed", "never answered", "mean", "P50", "P99", "kB")
+    columns = ("", "windows", "missed", "never answered", "mean", "P50", "P99", "kB a request")
     ours_label = f"`{SUREST}` in the same windows"
     rows: list[tuple[str | int, ...]] = []
     for name in (BETTER_DIRECT, *OTHERS):
@@ -166,8 +171,9 @@ def _others(content: Content) -> str:
     )
     return (
         f"{_UNANSWERED} P99 is of all requests.\n\n{table_as_markdown(Table('', columns, tuple(rows)))}"
-        "\nThe next table counts windows. Left of each colon is the number of windows in which the contender has the "
-        f"lower figure, right of it the number in which `{SUREST}` has it. In all other windows the two are equal."
+        "\nThe next table counts windows. The number before each colon counts the windows in which the contender has "
+        f"the lower figure. The number after it counts those in which `{SUREST}` has the lower figure. In all other "
+        "windows the two are equal."
         f"\n\n{table_as_markdown(Table('', ('', *told.values()), counts))}"
     )
 
@@ -238,7 +244,7 @@ def _modes(content: Content) -> str:
     found = content.get("redundancy_modes")
     if not found:
         return NOTHING
-    columns = ("`redundancy`", "windows", "missed", "of the misses that `replicate` avoids", "bytes beyond `single`")
+    columns = ("`redundancy`", "windows", "missed", "avoided misses (`replicate` = 100 %)", "bytes beyond `single`")
     rows = tuple(
         (
             f"`{name.removeprefix('plr-')}`",

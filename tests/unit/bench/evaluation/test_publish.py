@@ -82,7 +82,8 @@ def test_blocks_show_the_figures_of_the_data() -> None:
     blocks = all_blocks(content(*evaluation(), again=again))
     drives = blocks["drives"]
     assert (
-        "All 1 windows of recorded drives, 100 requests each; which of them are one drive was not looked at" in drives
+        "Every row covers all 1 windows of recorded drives, 100 requests together. Which of them are one drive was not"
+        in drives
     )
     alone = "| ROS 2 over the better path of each window, chosen afterwards"
     assert f"{alone} | 20.0 % | - | 0.0 % | 480 ms | 100 ms | 2.0 s |" in drives
@@ -112,7 +113,9 @@ def test_all_drives_are_shown_with_how_many_are_distinct_and_what_an_oracle_miss
         drives=Drives((tuple(scenarios),), 1),
     )
     drives = all_blocks(found)["drives"]
-    assert "All 2 windows of recorded drives, 200 requests each; only 1 of them are distinct drives" in drives
+    assert (
+        "covers all 2 windows of recorded drives, 200 requests together. Only 1 of the windows are distinct" in drives
+    )
     assert "multipath TCP | 2.5 % | 2.5 % | 2.5 % | 347 ms | 100 ms | no answer |" in drives
     assert "| `plr-replicate` | 2.0 % | 2.0 % | 0.0 % |" in drives
     assert "misses 0.5 %. This is 25 % of what `plr-replicate` misses." in drives
@@ -134,7 +137,7 @@ def test_modes_that_ran_in_fewer_drives_have_a_table_of_these() -> None:
     modes = ("plr-single", "plr-hedge", "plr-adaptive")
     runs = [*drive(1), *drive(2), *(run(name, scenario=drive(1)[0].scenario) for name in modes)]
     blocks = all_blocks(as_json(runs, []))
-    assert "All 2 windows" in blocks["drives"]
+    assert "all 2 windows" in blocks["drives"]
     assert "`plr-hedge`" not in blocks["drives"]
     assert "Every mode ran in 1 windows. In 1 of them, a direct run misses a request." in blocks["modes-drives"]
     assert "| `plr-hedge` |" in blocks["modes-drives"]
