@@ -333,7 +333,8 @@ class ControlClient:
         if code is grpc.StatusCode.UNAVAILABLE and self._connected and self._line is not None and self._line.broken:
             reason = f"{code.name}: {self._line.broken}"
         if code is grpc.StatusCode.UNAVAILABLE and not self._connected:
-            advice = tls_advice.explain(reason, self._tls.current if self._tls is not None else None, time.time())
+            # All of it: why TLS failed stands at its end.
+            advice = tls_advice.explain(error.details() or "", self._tls.current if self._tls is not None else None, time.time())
         return _StreamEndedError(advice or reason, refused=code in REFUSALS)
 
     async def _read(self, call: _Call) -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import concurrent.futures
+import contextlib
 import queue
 import random
 import subprocess
@@ -9,6 +11,7 @@ import sys
 import time
 from typing import TYPE_CHECKING
 
+import grpc
 import pytest
 
 from plr.controlplane.ca import Authority, Validity
@@ -232,6 +235,19 @@ def failure(address: str, folder: Path | None) -> str:
         return robot.client.last_failure
 
 
+@contextlib.contextmanager
+def expired_control_plane(authority: Authority, validity: Validity) -> Iterator[str]:
+    """A gRPC server with a control plane's certificate that is not valid now."""
+    issued = authority.issue("control-2", IdentityRole.CONTROL_PLANE, validity=validity)
+    server = grpc.server(concurrent.futures.ThreadPoolExecutor(1))
+    port = server.add_secure_port(
+        "127.0.0.1:0", grpc.ssl_server_credentials([(issued.key_pem, issued.certificate_pem)])
+    )
+    server.start()
+    yield f"127.0.0.1:{port}"
+    server.stop(None)
+
+
 def test_what_the_operator_reads_of_a_sidecar_that_does_not_get_in(plane: SecuredControlPlane, tmp_path: Path) -> None:
     now = time.time()
     stranger = Authority.create()
@@ -240,6 +256,11 @@ def test_what_the_operator_reads_of_a_sidecar_that_does_not_get_in(plane: Secure
     (tmp_path / "other" / "ca.pem").write_bytes(stranger.ca_pem + plane.authority.ca_pem)
     assert "it may not know our CA" in failure(plane.address, tmp_path / "other")
     past = Validity(now - 2 * HOUR_S, now - HOUR_S)
+    future = Validity(now + HOUR_S, now + 2 * HOUR_S)
+    plane.authority.write_tls_dir(tmp_path / "robot", "robot-1", IdentityRole.ROBOT)
+    for validity in (past, future):
+        with expired_control_plane(plane.authority, validity) as address:
+            assert "compare the clocks" in failure(address, tmp_path / "robot")
     plane.authority.write_tls_dir(tmp_path / "old", "robot-old", IdentityRole.ROBOT, validity=past)
     assert "expired" in (told := failure(plane.address, tmp_path / "old"))
     assert "plr ca renew robot-old" in told
