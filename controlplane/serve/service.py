@@ -205,6 +205,7 @@ class ControlPlaneService:
                     self._loop.unknown_message(name, str(error), again=told)
                     told, parts = True, [Heartbeat()]
                 if len(parts) == 1:
+                    await self._loop.prepare(parts[0])
                     self._loop.receive(stream, parts[0])
                 else:
                     async for _ in self._loop.turns.each(parts, lambda part: self._loop.receive(stream, part)):

@@ -407,8 +407,12 @@ class ControlCore:
 
     def set_policy(self, policy: Policy | None, now: float) -> None:
         """Put another policy in force: everybody is told what changes for them."""
+        self.set_permits(Permits(policy), now)
+
+    def set_permits(self, permits: Permits, now: float) -> None:
+        """Do the same with permits that were prepared for the members: this takes a fraction of the time."""
         alone = cut_off(self.registry, self.permits)
-        self.permits = Permits(policy)
+        self.permits = permits
         self._note_cut_off(alone, cut_off(self.registry, self.permits), now)
         self._refused_offers.clear()
         for sidecar in self.registry:
