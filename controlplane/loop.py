@@ -21,6 +21,7 @@ from plr.controlplane.core.control.events import (
 )
 from plr.controlplane.core.overload.line_share import LineShare
 from plr.controlplane.core.overload.report_share import ReportShares
+from plr.controlplane.core.policy.permits import Permits
 from plr.controlplane.core.policy.policy import OfferRule
 from plr.controlplane.core.problem.plan import Plan
 from plr.controlplane.core.problem.problem import Problem
@@ -37,7 +38,7 @@ from plr.protos.base.token_bucket import TokenBucket
 from plr.protos.convert import status_to_proto
 from plr.protos.model.fleet_events import EventKind
 from plr.protos.model.ids import Role
-from plr.protos.model.members import NO_REVOCATIONS, RemovalReason
+from plr.protos.model.members import NO_REVOCATIONS, RemovalReason, ServiceSet
 from plr.protos.trust.identity import EXPIRED, REVOKED, CertificateError
 
 if TYPE_CHECKING:
@@ -216,6 +217,13 @@ class ControlLoop:
         self._dispatch()
         return result, mailbox
 
+    async def prepare(self, message: SidecarMessage) -> None:
+        """Look up in turns what the policy says of services not heard of before, ahead of `receive`."""
+        permits = self._core.permits
+        if isinstance(message, ServiceSet) and (new := permits.not_looked_up(offer.name for offer in message.offers)):
+            async for _ in self.turns.each(new, permits.look_up):
+                pass
+
     def receive(self, stream: StreamId, message: SidecarMessage) -> None:
         """Handle one message of a stream; raises DecodeError if it has no place there."""
         self._core.receive(stream, message, self._loop.time())
@@ -280,11 +288,14 @@ class ControlLoop:
         """Explain why requests go where they go; raises UnknownNameError if the robot or its service is unknown."""
         return self._core.explain(robot, service, self._loop.time())
 
-    def set_policy(self, policy: Policy | None) -> None:
-        """Put another policy into force."""
+    async def set_policy(self, policy: Policy | None) -> None:
+        """Put another policy into force, once it is applied to all members: in turns, as there may be many rules."""
+        permits = await asyncio.to_thread(Permits, policy)
+        async for _ in self.turns.each(permits.prepare(list(self._core.registry)), lambda _: None):
+            pass
         rules = f"rules for calls {len(policy.calls)}, for offers {len(policy.offers)}" if policy else "none"
         self.events.record(EventKind.POLICY, text=rules)
-        self._core.set_policy(policy, self._loop.time())
+        self._core.set_permits(permits, self._loop.time())
         self._dispatch()
 
     def _dispatch(self) -> None:

@@ -14,7 +14,7 @@ from plr.controlplane.config.controlplane import load_config
 from plr.protos.base.errors import ConfigError
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Awaitable, Callable
     from pathlib import Path
 
     from plr.controlplane.config.controlplane import ControlPlaneConfig
@@ -55,7 +55,7 @@ class PolicyReload:
         """Read the file soon; for a signal handler."""
         self._requested.set()
 
-    async def run(self, apply: Callable[[Policy | None], None], metrics: Metrics) -> None:
+    async def run(self, apply: Callable[[Policy | None], Awaitable[None]], metrics: Metrics) -> None:
         """Serve requests until cancelled; `apply` puts a policy into force."""
         announce(self._config.settings().policy)
         while True:
@@ -67,10 +67,10 @@ class PolicyReload:
                 metrics.policy_reloads.labels("refused").inc()
                 log.error("%s; the policy in force stays", error)
                 continue
+            await self._take(config, apply)
             metrics.policy_reloads.labels("applied").inc()
-            self._take(config, apply)
 
-    def _take(self, config: ControlPlaneConfig, apply: Callable[[Policy | None], None]) -> None:
+    async def _take(self, config: ControlPlaneConfig, apply: Callable[[Policy | None], Awaitable[None]]) -> None:
         changed = [key for key in type(config).model_fields if getattr(config, key) != getattr(self._config, key)]
         others = [key for key in changed if key != "policy"]
         if others:
@@ -81,4 +81,4 @@ class PolicyReload:
         self._config = self._config.model_copy(update={"policy": config.policy})
         policy = self._config.settings().policy
         announce(policy)
-        apply(policy)
+        await apply(policy)

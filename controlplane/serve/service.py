@@ -206,6 +206,7 @@ class ControlPlaneService:
                 if not self._rates.take_entries(name, sum(map(announced_entries, parts)), time.monotonic()):
                     raise self._too_fast("large announcements arrive too fast")
                 if len(parts) == 1:
+                    await self._loop.prepare(parts[0])
                     self._loop.receive(stream, parts[0])
                 else:
                     async for _ in self._loop.turns.each(parts, lambda part: self._loop.receive(stream, part)):

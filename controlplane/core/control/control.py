@@ -81,10 +81,14 @@ PUBLISH_DELAY_EACH_S = 50e-6
 """Additional delay for each sidecar: examining one for news takes some tenth of it."""
 
 PUBLISHED_AT_ONCE = 200
-"""Sidecars examined for news in one go: some milliseconds, for which streams wait."""
+"""Sidecars examined for news in one go: some milliseconds, for which streams wait. One with many peers counts for
+more."""
 
 TOLD_AT_ONCE = 64
 """Sidecars that are sent a new revocation list in one go."""
+
+JUDGED_AT_ONCE = 32
+"""Sidecars of which the operator is told in one go what a new policy denies them."""
 
 _CLOSED_FOR = {
     RemovalReason.REVOKED: CloseReason.REVOKED,
@@ -139,6 +143,10 @@ class ControlCore:
         self._untold: deque[NodeName] = deque()
         """Sidecars that do not have it yet."""
         self._untold_since = now
+        self._unjudged: deque[tuple[NodeName, bool | None]] = deque()
+        """Sidecars to tell the operator of: whether the policy cuts them off now or no longer; None: what it lets them
+        not offer."""
+        self._unjudged_since = now
         self._refused_offers = RefusedOffers()
         self.restlessness = Restlessness()
         self.urgency = Urgency()
@@ -407,27 +415,40 @@ class ControlCore:
 
     def set_policy(self, policy: Policy | None, now: float) -> None:
         """Put another policy in force: everybody is told what changes for them."""
-        alone = cut_off(self.registry, self.permits)
-        self.permits = Permits(policy)
-        self._note_cut_off(alone, cut_off(self.registry, self.permits), now)
+        self.set_permits(Permits(policy), now)
+
+    def set_permits(self, permits: Permits, now: float) -> None:
+        """Do the same with permits that were prepared for the members: this takes a fraction of the time."""
+        before = cut_off(self.registry, self.permits)
+        self.permits = permits
+        after = cut_off(self.registry, permits)
         self._refused_offers.clear()
-        for sidecar in self.registry:
-            self._note_refused_offers(sidecar.name)
+        self._unjudged.extend((name, name in after) for name in sorted(before ^ after))
+        self._unjudged.extend((sidecar.name, None) for sidecar in self.registry if sidecar.offers)
+        self._unjudged_since = now
+        self._judge(now)
         self._publisher.all_changed()
         self._members_changed(now)
 
-    def _note_cut_off(self, before: frozenset[NodeName], after: frozenset[NodeName], now: float) -> None:
-        for name in sorted(before ^ after):
-            sidecar = self.registry.get(name)
-            if sidecar is None:
-                continue
-            lifted = name in before
-            if lifted:
-                self.departed.forget(name)
+    def _judge(self, now: float) -> None:
+        """Tell of some of those that a policy denies something; `next_timer` is past until all are told of."""
+        for _ in range(min(JUDGED_AT_ONCE, len(self._unjudged))):
+            name, alone = self._unjudged.popleft()
+            if alone is None:
+                self._note_refused_offers(name)
             else:
-                text = "connected, but the policy lets it talk to nobody; try: plr policy check"
-                self.departed.note(self._departure(sidecar, Why.POLICY, text, now))
-            self._events.append(CutOffNotice(name, sidecar.role, lifted))
+                self._note_cut_off(name, now, lifted=not alone)
+
+    def _note_cut_off(self, name: NodeName, now: float, *, lifted: bool) -> None:
+        sidecar = self.registry.get(name)
+        if sidecar is None:
+            return
+        if lifted:
+            self.departed.forget(name)
+        else:
+            text = "connected, but the policy lets it talk to nobody; try: plr policy check"
+            self.departed.note(self._departure(sidecar, Why.POLICY, text, now))
+        self._events.append(CutOffNotice(name, sidecar.role, lifted))
 
     def _note_refused_offers(self, name: NodeName) -> None:
         sidecar = self.registry.get(name)
@@ -454,6 +475,7 @@ class ControlCore:
             self.restlessness.next_time(),
             self._publishing_since if self._publications else None,
             self._untold_since if self._untold else None,
+            self._unjudged_since if self._unjudged else None,
             self._returning.until,
         )
         return min((time for time in times if time is not None), default=None)
@@ -488,6 +510,7 @@ class ControlCore:
         elif self._publications:
             self._go_on_publishing(now)
         self._tell_revocations()
+        self._judge(now)
 
     def remember(self, departures: Iterable[Departure], present: Iterable[Departure], now: float) -> None:
         """Remember what an earlier run knew: who was gone, and who was there; of these, those not back in time are

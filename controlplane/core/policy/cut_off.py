@@ -27,7 +27,9 @@ def cut_off(sidecars: Iterable[Sidecar], permits: Permits) -> frozenset[NodeName
     groups = {robot.name: permits.group(robot.name) for robot in members if robot.role is Role.ROBOT}
     if not clouds or not groups:
         return frozenset()
-    served = {group: any(permits.of(group, cloud) for cloud in clouds) for group in set(groups.values())}
-    lonely = {name for name, group in groups.items() if not served[group]}
-    lonely.update(cloud.name for cloud in clouds if not any(permits.of(group, cloud) for group in served))
+    served = frozenset[int]().union(*(permits.rules_that_serve(cloud) for cloud in clouds))
+    asking = frozenset[int]().union(*set(groups.values()))
+    lonely_groups = {group for group in set(groups.values()) if group.isdisjoint(served)}
+    lonely = {name for name, group in groups.items() if group in lonely_groups}
+    lonely.update(cloud.name for cloud in clouds if asking.isdisjoint(permits.rules_that_serve(cloud)))
     return frozenset(lonely)

@@ -3,8 +3,9 @@
 `*` is any text ('/' included), `?` one character, `[ab]` or `[!ab]` one of or none of. Case counts. The dialect is
 Python's `fnmatch.fnmatchcase`, as in the sidecars' `services[].name`.
 
-A pattern can only match names that begin with its text before the first special character. `PatternIndex` uses this: a
-fleet with a rule for each robot costs one look-up of each beginning of a name, not a match against each rule.
+A pattern can only match names that begin with its text before the first special character, and end with its text after
+the last one. `PatternIndex` uses this: a fleet with a rule for each robot or each site costs some look-ups of a name's
+beginning and end, not a match against each rule.
 """
 
 from __future__ import annotations
@@ -109,29 +110,77 @@ def _units(pattern: str) -> list[str]:
 
 
 _PLAIN_BEGINNING = re.compile(r"[^*?\[]*")
+_PLAIN_END = re.compile(r"[^*?]*\Z")
+_PLAIN_END_BEHIND_SETS = re.compile(r"[^*?\]]*\Z")
+
+
+class Glob:
+    """A pattern with stars, of which the beginning and the end are known to match; compiled once, when it is made."""
+
+    def __init__(self, pattern: str, beginning: str, end: str) -> None:
+        self._ends = len(beginning), len(end)
+        self._regular: re.Pattern[str] | None = None
+        self._between: tuple[str, ...] = ()
+        """Texts that follow each other in any distance, if that is all there is to it: faster than what `re` does."""
+        if "?" in pattern or "[" in pattern:
+            self._regular = re.compile(fnmatch.translate(pattern))
+        else:
+            self._between = tuple(filter(None, pattern.split("*")[1:-1]))
+
+    @property
+    def always(self) -> bool:
+        """Whether nothing is left to compare."""
+        return self._regular is None and not self._between
+
+    def matches(self, name: str) -> bool:
+        """Return whether it matches a name that begins and ends as it should."""
+        if self._regular is not None:
+            return self._regular.match(name) is not None
+        at, before_end = self._ends[0], len(name) - self._ends[1]
+        for text in self._between:
+            at = name.find(text, at, before_end)
+            if at < 0:
+                return False
+            at += len(text)
+        return True
 
 
 class PatternIndex:
     """Lists of patterns, numbered from 0."""
 
     def __init__(self, lists: Iterable[tuple[str, ...]]) -> None:
-        self._plain: defaultdict[str, set[int]] = defaultdict(set)
-        """Patterns without special characters."""
-        self._by_beginning: defaultdict[str, list[tuple[str, int]]] = defaultdict(list)
+        numbers: defaultdict[str, set[int]] = defaultdict(set)
         for number, patterns in enumerate(lists):
             for pattern in patterns:
-                beginning = _PLAIN_BEGINNING.match(pattern)
-                assert beginning is not None
-                if beginning[0] == pattern:
-                    self._plain[pattern].add(number)
-                else:
-                    self._by_beginning[beginning[0]].append((pattern, number))
+                numbers[pattern].add(number)
+        self._plain: dict[str, frozenset[int]] = {}
+        """Patterns without special characters."""
+        self._by_ends: dict[tuple[int, int], dict[tuple[str, str], list[tuple[Glob | None, frozenset[int]]]]] = {}
+        """The others by their plain beginning and end, and these by their lengths; None if these are all there is."""
+        for pattern, listed in numbers.items():
+            beginning, end = _ends(pattern)
+            if beginning == pattern:
+                self._plain[pattern] = frozenset(listed)
+                continue
+            glob = Glob(pattern, beginning, end)
+            like = self._by_ends.setdefault((len(beginning), len(end)), {})
+            like.setdefault((beginning, end), []).append((None if glob.always else glob, frozenset(listed)))
 
     def matching(self, name: str) -> frozenset[int]:
         """Return the numbers of the lists with a pattern that matches the name."""
         found = set(self._plain.get(name, ()))
-        for length in range(len(name) + 1):
-            for pattern, number in self._by_beginning.get(name[:length], ()):
-                if number not in found and matches(name, (pattern,)):
-                    found.add(number)
+        length = len(name)
+        for (begin, end), patterns in self._by_ends.items():
+            if begin + end <= length:
+                for glob, numbers in patterns.get((name[:begin], name[length - end :]), ()):
+                    if glob is None or (not numbers <= found and glob.matches(name)):
+                        found |= numbers
         return frozenset(found)
+
+
+def _ends(pattern: str) -> tuple[str, str]:
+    plain_end = _PLAIN_END_BEHIND_SETS if "[" in pattern else _PLAIN_END
+    beginning, end = _PLAIN_BEGINNING.match(pattern), plain_end.search(pattern)
+    assert beginning is not None
+    assert end is not None
+    return beginning[0], end[0]

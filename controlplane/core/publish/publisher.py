@@ -184,14 +184,15 @@ class Publisher:
         self._uninformed.clear()
 
     def publish(self, permits: Permits, plan: Plan, picture: Picture, now: float) -> Iterator[SendMessage | None]:
-        """Yield everything that is news to somebody, and None before each sidecar, for other work in between.
+        """Yield everything that is news to somebody, and None before each sidecar, for other work in between: several
+        times if it has many peers.
 
         Clouds come first: what a robot learns that it may call must be refused nowhere.
         """
         views = Views(self._registry, permits, self._known_peers)
         for name in self._take_due():
-            yield None
             sidecar = self._registry.get(name)
+            yield from views.looks(sidecar)
             if sidecar is None or sidecar.stream is None or self._is_held_back(sidecar, permits):
                 continue
             yield from self._peers(sidecar, sidecar.stream, views, permits)
@@ -223,8 +224,8 @@ class Publisher:
         """Yield the mappings of these robots that are news; the members have not changed since `publish`."""
         views = Views(self._registry, permits, self._known_peers)
         for name in robots:
-            yield None
             robot = self._registry.get(name)
+            yield from views.looks(robot)
             if robot is not None and robot.stream is not None and not self._is_held_back(robot, permits):
                 yield from self._mapping(robot, robot.stream, views, plan, picture, now)
 

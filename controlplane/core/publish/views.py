@@ -8,13 +8,14 @@ allows contact with them. Views are made for one publication, so that what many 
 from __future__ import annotations
 
 import dataclasses
+import itertools
 from typing import TYPE_CHECKING
 
 from plr.protos.model.ids import Role
 from plr.protos.model.members import ALL_CALLS, RemovalReason, RemovedPeer
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Mapping
+    from collections.abc import Collection, Iterator, Mapping, Sequence
 
     from plr.controlplane.core.policy.permits import Group, Permits
     from plr.controlplane.core.registry.registry import Registry, Sidecar
@@ -24,6 +25,9 @@ if TYPE_CHECKING:
 
 MAX_PERMITS_KEPT = 64
 """Permits kept per sidecar; clouds covered by the same rules have the same."""
+
+PEERS_OF_A_LOOK = 16
+"""Peers that make a sidecar as costly to examine as one without any."""
 
 
 class KnownPeers:
@@ -88,6 +92,13 @@ class Views:
         self._changes: dict[tuple[int, int], tuple[tuple[Peer, ...], tuple[Peer, ...]]] = {}
         """By the identities of a former and a present view: the former one, to keep it alive, and the differences."""
         self._servers: dict[Group, Mapping[NodeName, CallPermit]] = {}
+
+    def looks(self, sidecar: Sidecar | None) -> Iterator[None]:
+        """Yield once, and once more for every PEERS_OF_A_LOOK peers that a sidecar may have."""
+        peers: Sequence[Sidecar] = ()
+        if sidecar is not None:
+            peers = self._robots if sidecar.role is Role.CLOUD else self._clouds
+        return itertools.repeat(None, 1 + len(peers) // PEERS_OF_A_LOOK)
 
     def peers_of(self, sidecar: Sidecar) -> tuple[Peer, ...]:
         """Return the peers a sidecar is sent, by name."""

@@ -10,7 +10,11 @@ import pytest
 from plr.controlplane.core.control import control
 from plr.controlplane.core.estimate.estimator import Estimator
 from plr.controlplane.core.formulation import problem_builder
+from plr.controlplane.core.policy.policy import Policy
+from plr.controlplane.core.publish import views
 from plr.controlplane.core.publish.publisher import INFORM_S
+from plr.protos.model.fleet_events import Why
+from plr.protos.model.ids import NodeName
 from plr.protos.model.mapping import MappingSet
 from plr.protos.model.members import PeerSet
 from plr.protos.model.stream import Heartbeat
@@ -148,3 +152,34 @@ def test_a_robot_whose_paths_flap_all_the_time_waits_for_the_routine_and_others_
     world.run(0.1)
     (after,) = honest.services
     assert chosen not in after.assignments
+
+
+def test_a_new_policy_is_told_of_in_turns(world: World, monkeypatch: pytest.MonkeyPatch) -> None:
+    fleet(world)
+    monkeypatch.setattr(control, "JUDGED_AT_ONCE", 7)
+    world.core.set_policy(Policy(), world.now)
+
+    def told() -> int:
+        return sum(gone.why is Why.POLICY for gone in world.core.departed)
+
+    assert told() == 7
+    for turns in itertools.count(1):
+        timer = world.core.next_timer()
+        assert timer is not None
+        world.core.handle_timer(world.now)
+        assert told() <= 7 * (1 + turns)
+        if told() == ROBOTS + 2:
+            break
+        assert timer <= world.now, "it goes on at once"
+    world.core.set_policy(None, world.now)
+    world.run(SETTLED_S)
+    assert told() == 0
+
+
+def test_who_has_many_peers_counts_for_more(world: World, monkeypatch: pytest.MonkeyPatch) -> None:
+    robots = fleet(world)
+    cloud, robot = (world.core.registry.get(NodeName(name)) for name in ("a", robots[0].name))
+    monkeypatch.setattr(views, "PEERS_OF_A_LOOK", 10)
+    made = views.Views(world.core.registry, world.core.permits, views.KnownPeers())
+    assert len(list(made.looks(cloud))) == 1 + ROBOTS // 10
+    assert len(list(made.looks(robot))) == len(list(made.looks(None))) == 1

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from plr.controlplane.core.policy.patterns import PatternIndex, matches
 
-_NAMES = st.text("ab1", min_size=1, max_size=4)
+_NAMES = st.text("ab1]", min_size=1, max_size=4)
 _PATTERNS = st.text("ab1*?[!]", min_size=1, max_size=5)
 _LISTS = st.lists(st.lists(_PATTERNS | _NAMES, min_size=1, max_size=3).map(tuple), max_size=8)
 
