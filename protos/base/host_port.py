@@ -25,6 +25,9 @@ def split_host_port(text: str) -> tuple[str, int]:
         raise ValueError(f"expected an IPv6 address in brackets, as in [2001:db8::1]:50051, got {text!r}")
     if not _HOST.fullmatch(host):
         raise ValueError(f"expected host:port with a host name or IP address, got {text!r}")
+    # Resolvers take 1 for 0.0.0.1 and 010 for 8; no host name ends in a number (RFC 3696 section 2).
+    if host.rpartition(".")[2].isdigit():
+        canonical_ip(host)
     return host, int(port)
 
 
@@ -46,6 +49,9 @@ def check_remote(text: str) -> str:
         raise ValueError(f"expected host:port with a port from 1 to {_MAX_PORT}, got {text!r}")
     if host in _UNSPECIFIED:
         raise ValueError(f"expected an address that can be reached, got {text!r}")
+    address = numeric_host(text)
+    if address is not None and ip_address(address[0]).is_multicast:
+        raise ValueError(f"expected the address of one host, not of a multicast group, got {text!r}")
     return text
 
 

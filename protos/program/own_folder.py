@@ -55,6 +55,10 @@ class OwnFolder:
         """Release the folder."""
         os.close(self._descriptor)
 
+    def open_itself(self) -> int:
+        """Return a descriptor of the folder itself, for a lock where no file can be created."""
+        return os.open(".", os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC, dir_fd=self._descriptor)
+
     def open(self, name: str, flags: int) -> int:
         """Return a descriptor of a file in it, 0600 if `flags` create it; a link, or another user's, is refused."""
         try:

@@ -10,6 +10,7 @@ Both planes read their identity with it; no core does.
 
 from __future__ import annotations
 
+import codecs
 import dataclasses
 import logging
 import os
@@ -139,9 +140,12 @@ def _node(directory: Path, trust: Trust, ca_pem: bytes, crl_pem: bytes | None) -
 
 
 def _read(path: Path, forbidden: int) -> bytes:
-    """Do the same as `read_guarded`, with advice on a file that is missing or unreadable for us."""
+    """Do the same as `read_guarded`, with advice on a file that is missing or unreadable for us.
+
+    Leave out the byte order mark that some editors put first: gRPC takes no PEM behind it, though `cryptography` does.
+    """
     try:
-        return read_guarded(path, forbidden)
+        return read_guarded(path, forbidden).removeprefix(codecs.BOM_UTF8)
     except ConfigError as error:
         if isinstance(error.__cause__, FileNotFoundError):
             raise ConfigError(error.source, "", "there is no such file; copy the one of plr ca issue") from error

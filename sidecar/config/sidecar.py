@@ -53,6 +53,9 @@ if TYPE_CHECKING:
 DEFAULT_CLOUD_UDP_PORT = 24700
 """Fixed, as a firewall rule has to name it; below Linux's ephemeral ports (32768 and up)."""
 
+MAX_SERVICES = 1024
+"""Entries of `services`: more than a sidecar offers or carries. A glob stands for any number of services."""
+
 
 class LogLevel(enum.Enum):
     """How much is logged."""
@@ -112,7 +115,7 @@ class SidecarConfig(Section):
     """`true` in place of `tls_dir` turns certificates off. Every sidecar can then claim any name, and anyone on the
     network can read and change the traffic. Use it only for trials on one machine. The sidecar then refuses a
     `control_plane` on another host, unless the command line contains `--insecure-i-know`."""
-    services: Annotated[tuple[ServiceConfig, ...], Field(min_length=1), converted]
+    services: Annotated[tuple[ServiceConfig, ...], Field(min_length=1, max_length=MAX_SERVICES), converted]
     """The services that the sidecar carries. It carries no others. The first entry that matches a service's name
     applies."""
     interfaces: (
@@ -288,12 +291,15 @@ def _cross_checks(config: SidecarConfig) -> Iterator[_Problem]:
     for index, service in enumerate(config.services):
         for key, problem in service.problems(config.role):
             yield ("services", index, key), problem
-        yield from _check_order(config, index)
+    yield from _check_order(config)
     if config.advertise and config.udp_port == 0:
         yield ("udp_port",), "expected a fixed port beside advertise, got 0"
     for index, network in enumerate(config.networks):
         if any(network.interface == before.interface for before in config.networks[:index]):
             yield ("networks", index, "interface"), f"expected each interface once, got '{network.interface}' again"
+        elif (winner := _network_before(config.networks[:index], network.interface)) is not None:
+            problem = f"expected before '{winner}', which matches '{network.interface}' first"
+            yield ("networks", index, "interface"), problem
     for index, advertised in enumerate(config.advertise):
         if advertised.interface is not None and is_glob(advertised.interface):
             yield ("advertise", index, "interface"), f"expected a name, got the glob '{advertised.interface}'"
@@ -301,23 +307,51 @@ def _cross_checks(config: SidecarConfig) -> Iterator[_Problem]:
             yield ("advertise", index), "expected each entry once"
 
 
-def _check_order(config: SidecarConfig, index: int) -> Iterator[_Problem]:
-    name = config.services[index].name
-    for before, service in enumerate(config.services[:index]):
-        if service.name == name:
+def _network_before(earlier: Iterable[NetworkConfig], interface: str) -> str | None:
+    """Return the earlier entry that matches an interface first, or all that a glob matches; None if there is none."""
+    globs = [network.interface for network in earlier if is_glob(network.interface)]
+    if is_glob(interface):
+        return _covering(globs, interface)
+    return next((glob for glob in globs if fnmatch.fnmatchcase(interface, glob)), None)
+
+
+def _check_order(config: SidecarConfig) -> Iterator[_Problem]:
+    """Find services that are named twice, or that an earlier glob matches first."""
+    rules = Rules(config.service_rules())
+    names: dict[str, int] = {}
+    globs: list[str] = []
+    fallbacks: dict[str, int] = {}
+    for index, service in enumerate(config.services):
+        if service.fallback is not None and fallbacks.setdefault(service.fallback, index) != index:
             yield (
-                ("services", index, "name"),
-                f"expected each name once, got '{name}' in services[{before}] too",
+                ("services", index, "fallback"),
+                f"expected another than that of services[{fallbacks[service.fallback]}]",
             )
-        if service.fallback is not None and service.fallback == config.services[index].fallback:
-            yield ("services", index, "fallback"), f"expected another than that of services[{before}]"
-    for other, service in enumerate(config.services):
-        if service.fallback == name:
-            yield ("services", index, "name"), f"expected a service that is not the fallback of services[{other}]"
-    if not is_glob(name):
-        winner = Rules(config.service_rules()[:index]).find(ServiceName(name))
-        if winner is not None and winner.pattern != name:
-            yield (
-                ("services", index, "name"),
-                f"expected before the glob '{winner.pattern}', which matches '{name}' first",
-            )
+    for index, service in enumerate(config.services):
+        name = service.name
+        if names.setdefault(name, index) != index:
+            yield ("services", index, "name"), f"expected each name once, got '{name}' in services[{names[name]}] too"
+            continue
+        if name in fallbacks:
+            problem = f"expected a service that is not the fallback of services[{fallbacks[name]}]"
+            yield ("services", index, "name"), problem
+        winner = _covering(globs, name) if is_glob(name) else _winner(rules, name)
+        if is_glob(name):
+            globs.append(name)
+        if winner is not None:
+            yield ("services", index, "name"), f"expected before the glob '{winner}', which matches '{name}' first"
+
+
+def _winner(rules: Rules, name: str) -> str | None:
+    """Return the glob that matches a name before its own rule; None if there is none."""
+    rule = rules.find(ServiceName(name))
+    return None if rule is None or rule.pattern == name else rule.pattern
+
+
+def _covering(earlier: Iterable[str], glob: str) -> str | None:
+    """Return an earlier glob that surely matches all that this one matches: plain text, and one star at its end."""
+    for before in earlier:
+        beginning = before.removesuffix("*")
+        if beginning != before and not is_glob(beginning) and glob.startswith(beginning):
+            return before
+    return None

@@ -334,7 +334,9 @@ class ControlClient:
             reason = f"{code.name}: {self._line.broken}"
         if code is grpc.StatusCode.UNAVAILABLE and not self._connected:
             # All of it: why TLS failed stands at its end.
-            advice = tls_advice.explain(error.details() or "", self._tls.current if self._tls is not None else None, time.time())
+            advice = tls_advice.explain(
+                error.details() or "", self._tls.current if self._tls is not None else None, time.time()
+            )
         return _StreamEndedError(advice or reason, refused=code in REFUSALS)
 
     async def _read(self, call: _Call) -> None:

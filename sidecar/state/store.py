@@ -7,6 +7,8 @@ sidecar from running.
 
 from __future__ import annotations
 
+import contextlib
+import errno
 import fcntl
 import logging
 import os
@@ -263,6 +265,11 @@ def _unusable(error: OSError) -> StateDirError:
 def _open_lock(folder: OwnFolder) -> int:
     try:
         return folder.open(LOCK_FILE, os.O_RDWR | os.O_CREAT)
-    except OSError:
-        # A card that has become read-only still holds the last mapping: the lock of an earlier run is enough.
-        return folder.open(LOCK_FILE, os.O_RDONLY)
+    except OSError as error:
+        # A card that has become read-only still holds the last mapping: the lock of an earlier run is enough. If it
+        # never held any, the folder itself is locked, and the sidecar runs without state as with a full disk.
+        with contextlib.suppress(FileNotFoundError):
+            return folder.open(LOCK_FILE, os.O_RDONLY)
+        if error.errno == errno.EROFS:
+            return folder.open_itself()
+        raise

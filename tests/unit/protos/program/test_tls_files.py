@@ -115,6 +115,17 @@ def test_owner_and_group_may_read_the_key(folder: Path, mode: int) -> None:
     load_tls_files(folder)
 
 
+@pytest.mark.audit("ops-3")
+def test_a_byte_order_mark_does_not_reach_grpc(folder: Path) -> None:
+    plain = load_tls_files(folder)
+    for name in ("cert.pem", "key.pem", "ca.pem", "crl.pem"):
+        path = folder / name
+        if path.exists():
+            path.write_bytes(b"\xef\xbb\xbf" + path.read_bytes())
+    read = load_tls_files(folder)
+    assert (read.certificate_pem, read.key_pem, read.ca_pem) == (plain.certificate_pem, plain.key_pem, plain.ca_pem)
+
+
 def test_an_expired_or_revoked_node_can_read_its_files_still(tmp_path: Path) -> None:
     ca = Authority.create(clock=lambda: 1_000_000_000.0)
     issued = ca.issue("robot-1", IdentityRole.ROBOT)

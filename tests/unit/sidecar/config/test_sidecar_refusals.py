@@ -1,13 +1,18 @@
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import pytest
 import yaml
 
 from plr.protos.base.errors import ConfigError
-from plr.sidecar.config.sidecar import parse_config
+from plr.sidecar.config import sidecar as sidecar_config
+from plr.sidecar.config.sidecar import MAX_SERVICES, parse_config
+from plr.sidecar.core.rules.service_rule import Rules, ServiceRule
 from tests.unit.sidecar.configs import BACKED, CLOUD, ROBOT, SAFE, SOURCE, parse, with_service
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
 
 BAD_VALUES: list[tuple[dict[str, Any], str, str]] = [
     (ROBOT | {"interface": ["wlan0"]}, "interface", "unknown key; did you mean interfaces?"),
@@ -82,6 +87,9 @@ BAD_VALUES: list[tuple[dict[str, Any], str, str]] = [
     (ROBOT | {"region": "eu"}, "region", "on a cloud only"),
     (CLOUD | {"region": "eu central"}, "region", "expected 1 to 63 letters"),
     (CLOUD | {"networks": [{"interface": "eth0"}]}, "networks", "on a robot only"),
+    (ROBOT | {"control_plane": "1:50051"}, "control_plane", "expected an IP address, got '1'"),
+    (ROBOT | {"control_plane": "010.000.000.001:50051"}, "control_plane", "expected an IP address"),
+    (ROBOT | {"control_plane": "224.0.0.1:50051"}, "control_plane", "not of a multicast group"),
     (ROBOT | {"networks": [{"interface": "wlan0"}] * 2}, "networks[1].interface", "once, got 'wlan0' again"),
     (ROBOT | {"networks": [{"interface": "wlan0", "carrier": "a b"}]}, "networks[0].carrier", "expected 1 to 63"),
     (ROBOT | {"services": [{"name": "/a"}]}, "services[0].deadline_ms", "expected milliseconds"),
@@ -204,6 +212,41 @@ def test_a_name_behind_a_glob_that_matches_it_is_refused() -> None:
     with pytest.raises(ConfigError, match=r"services\[1\]\.name: expected before the glob '/a\*'"):
         parse(ROBOT, services=services("/a*", "/ab"))
     parse(ROBOT, services=services("/ab", "/a*"))
+
+
+@pytest.mark.audit("ops-5")
+def test_a_glob_behind_one_that_matches_all_of_it_is_refused() -> None:
+    with pytest.raises(
+        ConfigError, match=r"services\[1\]\.name: expected before the glob '/\*', which matches '/arm/\*'"
+    ):
+        parse(ROBOT, services=services("/*", "/arm/*"))
+    parse(ROBOT, services=services("/arm/*", "/*"))
+    parse(ROBOT, services=services("/arm/?", "/arm/*", "/leg/*"))
+
+
+@pytest.mark.audit("ops-5")
+def test_a_network_behind_a_glob_that_matches_it_is_refused() -> None:
+    for later in ("wlan0", "wl*"):
+        with pytest.raises(ConfigError, match=r"networks\[1\]\.interface: expected before '\*', which matches 'wl"):
+            parse(ROBOT, networks=[{"interface": "*"}, {"interface": later, "cost_per_request": 2}])
+    parse(ROBOT, networks=[{"interface": "wlan0"}, {"interface": "wl*"}, {"interface": "*"}])
+
+
+@pytest.mark.audit("ops-5")
+def test_many_services_are_checked_against_one_set_of_rules(monkeypatch: pytest.MonkeyPatch) -> None:
+    made = 0
+
+    class Counted(Rules):
+        def __init__(self, rules: Iterable[ServiceRule]) -> None:
+            nonlocal made
+            made += 1
+            super().__init__(rules)
+
+    monkeypatch.setattr(sidecar_config, "Rules", Counted)
+    parse(ROBOT, services=services(*(f"/service_{number}" for number in range(MAX_SERVICES))))
+    assert made == 1
+    with pytest.raises(ConfigError, match=rf"services: .*{MAX_SERVICES}"):
+        parse(ROBOT, services=services(*(f"/service_{number}" for number in range(MAX_SERVICES + 1))))
 
 
 def test_a_parameter_service_may_stand_behind_a_glob_which_does_not_open_it() -> None:

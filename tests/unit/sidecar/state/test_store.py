@@ -360,6 +360,21 @@ def test_a_card_gone_read_only_still_yields_the_last_mapping(tmp_path: Path) -> 
     assert "Read-only file system" in done.stderr
 
 
+@pytest.mark.audit("ops-5")
+@pytest.mark.skipif(os.geteuid() != 0, reason="mounting takes root")
+def test_a_card_that_was_read_only_from_the_beginning_keeps_no_sidecar_from_running(tmp_path: Path) -> None:
+    script = f"""
+    set -e
+    mount -t tmpfs -o ro none {tmp_path}
+    cd {Path(__file__).parents[4]}
+    {sys.executable} -c '{OPEN_AND_REMEMBER}' {tmp_path} 5
+    """
+    done = subprocess.run(["unshare", "--mount", "bash", "-c", script], capture_output=True, text=True, timeout=60)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.split() == ["None"]
+    assert "Read-only file system" in done.stderr
+
+
 OPEN_AND_REMEMBER = """
 import sys
 from pathlib import Path
