@@ -444,6 +444,7 @@ class ControlLoop:
                     if share is not None:
                         self.report_shares.follow(share, now)
                     self._prepare_if_quiet(share)
+                    self.events.keep_held()
                     self.update_metrics()
                     self._garbage.look_if_worth(len(self._core.registry))
                     metrics_at = now + METRICS_INTERVAL_S

@@ -19,7 +19,7 @@ import threading
 import time
 from bisect import bisect_left
 from collections import deque
-from typing import IO, TYPE_CHECKING
+from typing import IO, TYPE_CHECKING, NamedTuple
 
 from plr.controlplane.core.explain.event_memory import EventMemory
 from plr.controlplane.observe.event_lines import decode, encode
@@ -57,6 +57,22 @@ CLOSE_TIMEOUT_S = 2.0
 """Time limit for writing the last lines: a slow disk must not hold up a stop."""
 
 
+PRESENCE = frozenset({EventKind.CONNECTED, EventKind.STREAM_LOST, EventKind.DEPARTED})
+"""What `remembered` needs to know, after a restart, who was present and why others were gone."""
+
+
+class _Said(NamedTuple):
+    """An event as it was told."""
+
+    at: float
+    """Seconds since 1970."""
+    kind: EventKind
+    text: str
+    role: Role | None
+    why: Why | None
+    seen_at: float | None
+
+
 class EventLog:
     """Takes events on the loop's thread; without a folder it keeps them in memory only."""
 
@@ -75,6 +91,9 @@ class EventLog:
         self._retry_s = retry_s
         self._memory = EventMemory()
         self._suppressed: dict[NodeName, int] = {}
+        self._held: dict[NodeName, _Said] = {}
+        """The last event of a member that says whether it is present, if that exceeds its share."""
+        self._too_often = 0
         self._damaged = 0
         self._write_failures = 0
         self._problem = ""
@@ -115,17 +134,42 @@ class EventLog:
         seen_s: float | None = None,
     ) -> None:
         """Record an event; `seen_s` is how long ago a departed member was last heard from."""
-        if not self._memory.admits(node, self._clock()):
-            if node is not None and (node in self._suppressed or len(self._suppressed) < MAX_UNWRITTEN):
-                self._suppressed[node] = self._suppressed.get(node, 0) + 1
+        at = self._wall()
+        said = _Said(at, kind, text, role, why, at - seen_s if seen_s is not None else None)
+        if node is None or self._memory.admits(node, self._clock(), presence=kind in PRESENCE):
+            if node is not None and (held := self._held.pop(node, None)) is not None and kind not in PRESENCE:
+                self._keep(node, held)
+            self._keep(node, said)
             return
+        if kind in PRESENCE:
+            self._held[node] = said
+        self._too_often += 1
+        if node in self._suppressed or len(self._suppressed) < MAX_UNWRITTEN:
+            self._suppressed[node] = self._suppressed.get(node, 0) + 1
+
+    def keep_held(self) -> None:
+        """Record the last change of presence of members that had more than their share, once there is room for it."""
+        now = self._clock()
+        for node in [node for node in self._held if self._memory.admits(node, now, presence=True)]:
+            self._keep_held(node)
+
+    def _keep_held(self, node: NodeName) -> None:
+        self._too_often -= 1
+        if self._suppressed.get(node, 0) > 1:
+            self._suppressed[node] -= 1
+        else:
+            self._suppressed.pop(node, None)
+        self._keep(node, self._held.pop(node))
+
+    def _keep(self, node: NodeName | None, said: _Said) -> None:
+        text = said.text
         if node is not None and (more := self._suppressed.pop(node, 0)):
             text = f"{text} (and {more} earlier events that were too many to keep)"
-        at = self._wall()
         # Numbers grow even after the log was lost: a client that asks for new events must not wait for a catch-up.
-        number = max(self._memory.last_number + 1, int(at * 1e6))
-        seen_at = at - seen_s if seen_s is not None else None
-        event = FleetEvent(number, at, kind, node, clean_text(text.strip()), role, why, seen_at)
+        number = max(self._memory.last_number + 1, int(self._wall() * 1e6))
+        event = FleetEvent(
+            number, said.at, said.kind, node, clean_text(text.strip()), said.role, said.why, said.seen_at
+        )
         with self._condition:
             self._memory.add(event)
             if self._writer is None:
@@ -162,7 +206,7 @@ class EventLog:
         return EventLogState(
             kept=len(self._memory),
             evicted=self._memory.evicted,
-            too_often=self._memory.too_often,
+            too_often=self._too_often,
             damaged=self._damaged,
             write_failures=self._write_failures,
             on_disk=self._writer is not None and not self._problem,
@@ -171,6 +215,8 @@ class EventLog:
 
     def close(self) -> None:
         """Write what is still unwritten, if the disk takes it in time."""
+        for node in list(self._held):
+            self._keep_held(node)
         if self._writer is None:
             return
         with self._condition:

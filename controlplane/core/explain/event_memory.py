@@ -25,6 +25,9 @@ EVENTS_BURST = 64.0
 EVENTS_PER_S = 1.0 / 30.0
 """Rate after that; each event is written to the disk."""
 
+PRESENCE_BURST, PRESENCE_PER_S = 8.0, 0.1
+"""Further events of one member that say whether it is present: these must not be missing after a restart."""
+
 
 class EventMemory:
     """Events in the order they came."""
@@ -35,10 +38,9 @@ class EventMemory:
         self._holders: dict[int, OrderedDict[Owner, None]] = {}
         """Owners that have this many events, by that number."""
         self._most = 0
-        self._shares: dict[Owner, TokenBucket] = {}
-        """Shares of those who have events, so that there are no more shares than events."""
+        self._shares: dict[Owner, tuple[TokenBucket, TokenBucket]] = {}
+        """Shares of those who have events, so that there are no more shares than events; the second is for presence."""
         self.evicted = 0
-        self.too_often = 0
 
     def __len__(self) -> int:
         return len(self._events)
@@ -55,21 +57,21 @@ class EventMemory:
         """Return the last events, the oldest first."""
         return [*islice(reversed(self._events.values()), count)][::-1]
 
-    def admits(self, owner: Owner, now: float) -> bool:
-        """Return whether one more event of this member is within its share; the control plane's own always are. `now`
-        is in monotonic seconds."""
+    def admits(self, owner: Owner, now: float, *, presence: bool = False) -> bool:
+        """Return whether one more event of this member is within its share; the control plane's own always are.
+
+        `presence`: it says whether the member is present. `now` is in monotonic seconds. The caller adds what is
+        admitted.
+        """
         if owner is None:
             return True
         share = self._shares.get(owner)
         if share is None:
-            # Kept from its first event on.
-            share = TokenBucket(rate=EVENTS_PER_S, burst=EVENTS_BURST, now=now)
-            if owner in self._of:
-                self._shares[owner] = share
-        if share.take(now):
-            return True
-        self.too_often += 1
-        return False
+            share = self._shares[owner] = (
+                TokenBucket(rate=EVENTS_PER_S, burst=EVENTS_BURST, now=now),
+                TokenBucket(rate=PRESENCE_PER_S, burst=PRESENCE_BURST, now=now),
+            )
+        return share[0].take(now) or (presence and share[1].take(now))
 
     def add(self, event: FleetEvent) -> None:
         """Keep an event whose number is above all others'."""

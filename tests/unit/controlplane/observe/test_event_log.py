@@ -11,6 +11,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from plr.controlplane.core.explain import event_memory
 from plr.controlplane.observe import event_log
 from plr.controlplane.observe.event_lines import decode, encode
 from plr.controlplane.observe.event_log import FILE, EventLog
@@ -191,6 +192,65 @@ def test_what_was_left_out_of_a_members_share_is_said(tmp_path: Path) -> None:
     left_out = log.state.too_often
     assert left_out > 100
     assert f"and {left_out} earlier events" in log.events()[-1].text
+
+
+def flaps(log: EventLog, times: int) -> None:
+    for _ in range(times):
+        log.record(EventKind.STREAM_LOST, ROBOT, role=Role.ROBOT)
+        log.record(EventKind.CONNECTED, ROBOT, role=Role.ROBOT)
+
+
+def after_a_restart(folder: Path) -> tuple[list[Why], list[NodeName]]:
+    """Return why members are gone, and who is awaited."""
+    log = EventLog(folder)
+    gone, present = departures(log.events(), ran_until=log.ran_until, now_wall=time.time(), now=1000.0)
+    log.close()
+    return [one.why for one in gone], [one.name for one in present]
+
+
+@pytest.mark.parametrize("stopped", [True, False])
+def test_a_member_that_flapped_is_after_a_restart_what_it_was_before(tmp_path: Path, *, stopped: bool) -> None:
+    now = 0.0
+    log = EventLog(tmp_path, clock=lambda: now)
+    if stopped:
+        flaps(log, 500)
+        log.record(EventKind.DEPARTED, ROBOT, role=Role.ROBOT, why=Why.DRAINED, seen_s=3.0)
+    else:
+        log.record(EventKind.DEPARTED, ROBOT, role=Role.ROBOT, why=Why.DRAINED)
+        flaps(log, 500)
+    log.close()
+    assert after_a_restart(tmp_path) == (([Why.DRAINED], []) if stopped else ([], [ROBOT]))
+
+
+def test_the_last_change_of_a_member_that_flapped_is_written_before_long(tmp_path: Path) -> None:
+    now = 0.0
+    log = EventLog(tmp_path, clock=lambda: now)
+    flaps(log, 500)
+    log.record(EventKind.DEPARTED, ROBOT, role=Role.ROBOT, why=Why.DRAINED)
+    kept = len(log.events())
+    log.keep_held()
+    assert len(log.events()) == kept, "its share is spent"
+    now = 1.0 / event_memory.PRESENCE_PER_S
+    log.keep_held()
+    last = log.events()[-1]
+    assert (last.kind, last.why) == (EventKind.DEPARTED, Why.DRAINED)
+    assert f"and {log.state.too_often} earlier events" in last.text
+    assert log.state.too_often + len(log.events()) == 1001
+    log.keep_held()
+    assert log.events()[-1] is last
+    log.close()
+
+
+def test_what_waits_goes_before_another_event_of_its_member() -> None:
+    now = 0.0
+    log = EventLog(None, clock=lambda: now)
+    flaps(log, 500)
+    log.record(EventKind.STREAM_LOST, ROBOT, role=Role.ROBOT)
+    now = 1.0 / event_memory.EVENTS_PER_S
+    log.record(EventKind.REFUSED, ROBOT, "registration: too often")
+    assert [event.kind for event in log.events()[-2:]] == [EventKind.STREAM_LOST, EventKind.REFUSED]
+    numbers = [event.number for event in log.events()]
+    assert numbers == sorted(set(numbers))
 
 
 def test_a_question_is_answered_with_what_it_asks_for() -> None:

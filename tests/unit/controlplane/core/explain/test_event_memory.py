@@ -4,7 +4,13 @@ from __future__ import annotations
 
 import pytest
 
-from plr.controlplane.core.explain.event_memory import EVENTS_BURST, EVENTS_PER_S, MAX_EVENTS, EventMemory
+from plr.controlplane.core.explain.event_memory import (
+    EVENTS_BURST,
+    EVENTS_PER_S,
+    MAX_EVENTS,
+    PRESENCE_BURST,
+    EventMemory,
+)
 from plr.protos.model.fleet_events import EventKind, FleetEvent
 from plr.protos.model.ids import NodeName
 
@@ -44,8 +50,8 @@ def test_a_member_has_its_share_and_the_control_plane_is_not_counted() -> None:
             memory.add(event(number, "flapping"))
             taken += 1
         assert memory.admits(None, 10.0)
-    assert EVENTS_BURST <= taken <= EVENTS_BURST + 1
-    assert memory.too_often == 1000 - taken
+    assert taken == EVENTS_BURST
+    assert sum(memory.admits("flapping", 10.0, presence=True) for _ in range(100)) == PRESENCE_BURST
     assert memory.admits("another", 10.0)
     assert memory.admits("flapping", 10.0 + 1.0 / EVENTS_PER_S)
 
