@@ -102,7 +102,6 @@ controlplane/core/overload/postponed.py
 controlplane/core/policy/cut_off.py
 controlplane/core/policy/explain.py
 controlplane/core/policy/path_rules.py
-controlplane/core/policy/permits.py
 controlplane/core/policy/refused_offers.py
 controlplane/core/policy/report_filter.py
 controlplane/core/problem/domains.py

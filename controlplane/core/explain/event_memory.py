@@ -7,6 +7,7 @@ from collections import OrderedDict, deque
 from itertools import islice
 from typing import TYPE_CHECKING
 
+from plr.controlplane.core.base.holders import Holders
 from plr.protos.base.token_bucket import TokenBucket
 
 if TYPE_CHECKING:
@@ -35,9 +36,7 @@ class EventMemory:
     def __init__(self) -> None:
         self._events: OrderedDict[int, FleetEvent] = OrderedDict()
         self._of: dict[Owner, deque[int]] = {}
-        self._holders: dict[int, OrderedDict[Owner, None]] = {}
-        """Owners that have this many events, by that number."""
-        self._most = 0
+        self._holders: Holders[Owner] = Holders()
         self._shares: dict[Owner, tuple[TokenBucket, TokenBucket]] = {}
         """Shares of those who have events, so that there are no more shares than events; the second is for presence."""
         self.evicted = 0
@@ -76,27 +75,15 @@ class EventMemory:
     def add(self, event: FleetEvent) -> None:
         """Keep an event whose number is above all others'."""
         self._events[event.number] = event
-        own = self._of.setdefault(event.node, deque())
-        self._count(event.node, len(own), len(own) + 1)
-        own.append(event.number)
+        self._of.setdefault(event.node, deque()).append(event.number)
+        self._holders.add(event.node)
         if len(self._events) > MAX_EVENTS:
             self._evict()
 
-    def _count(self, owner: Owner, before: int, after: int) -> None:
-        if before:
-            del self._holders[before][owner]
-            if not self._holders[before]:
-                del self._holders[before]
-        if after:
-            self._holders.setdefault(after, OrderedDict())[owner] = None
-            self._most = max(self._most, after)
-        while self._most and self._most not in self._holders:
-            self._most -= 1
-
     def _evict(self) -> None:
-        owner = next(iter(self._holders[self._most]))
+        owner = self._holders.greediest()
+        self._holders.remove(owner)
         own = self._of[owner]
-        self._count(owner, len(own), len(own) - 1)
         del self._events[own.popleft()]
         if not own:
             del self._of[owner]

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 from plr.controlplane.core.problem.problem import BlockKey
 from plr.controlplane.core.publish import history as mapping_history
 from plr.controlplane.core.publish.history import MAX_REMEMBERED_CHANGES, MappingHistory
-from plr.protos.model.ids import InterfaceName, NodeName, Version
+from plr.protos.model.ids import InterfaceName, NodeName, ServiceName, Version
 from plr.protos.model.mapping import Assignment, MappingSet, ServiceMapping
 from tests.support.samples import PLAN
 
@@ -48,5 +48,21 @@ def test_old_changes_and_old_histories_go(monkeypatch: pytest.MonkeyPatch) -> No
     history.note(ROBOT, sent(99, "a"), 51.0)
     history.note(NodeName("third"), sent(1, "a"), 52.0)
     assert history.dropped == 1
-    assert history.of(BlockKey(NodeName("second"), PLAN)) is None
-    assert history.of(KEY) is not None
+
+
+def test_a_robot_that_names_ever_new_services_loses_its_own_histories(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(mapping_history, "MAX_HISTORIES", 20)
+    history = MappingHistory()
+    honest = [NodeName(f"honest-{number}") for number in range(10)]
+    for name in honest:
+        history.note(name, sent(1, "a"), 1.0)
+    for number in range(1000):
+        mapping = ServiceMapping(ServiceName(f"/service_{number}"), (), 0.1, "")
+        history.note(ROBOT, MappingSet(Version(number + 1), 1, (mapping,)), 2.0)
+    for name in honest:
+        found = history.of(BlockKey(name, PLAN))
+        assert found is not None
+        assert found.since == 1.0
+    assert history.dropped == 1000 - 10
+    assert history.of(BlockKey(ROBOT, ServiceName("/service_999"))) is not None
+    assert history.of(BlockKey(ROBOT, ServiceName("/service_0"))) is None
