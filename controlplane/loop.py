@@ -36,10 +36,10 @@ from plr.controlplane.serve.mailbox import Mailbox
 from plr.controlplane.turns import Turns
 from plr.protos.base.token_bucket import TokenBucket
 from plr.protos.convert import status_to_proto
-from plr.protos.model.fleet_events import EventKind
+from plr.protos.model.fleet_events import EventKind, Why
 from plr.protos.model.ids import Role
 from plr.protos.model.members import NO_REVOCATIONS, RemovalReason, ServiceSet
-from plr.protos.trust.identity import EXPIRED, REVOKED, CertificateError
+from plr.protos.trust.identity import EXPIRED, NOT_YET_VALID, REVOKED, CertificateError
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -387,6 +387,13 @@ class ControlLoop:
         """Return the members whose certificates have expired."""
         in_use = ((name, caller.identity.not_after) for name, caller in self._callers.items())
         return self._earliest_end.ended(in_use, now_wall)
+
+    def refused_member(self, name: NodeName, error: CertificateError) -> None:
+        """Record that a member's connection was refused."""
+        self.events.record(EventKind.REFUSED, name, f"connection: {error}")
+        why = Why.REVOKED if error.reason == REVOKED else Why.CERTIFICATE_EXPIRED
+        if error.reason in {REVOKED, EXPIRED, NOT_YET_VALID}:
+            self._core.note_refused(name, why, str(error))
 
     def _part_with(self, name: NodeName, error: CertificateError) -> None:
         del self._callers[name]

@@ -113,7 +113,7 @@ async def serve(
         gate = TlsGate(files, upstreams, metrics.refused_connection, clock) if files is not None else None
         if gate is not None:
             loop.has_unread = gate.has_unread
-            gate.on_member_refused = lambda name, text: events.record(EventKind.REFUSED, name, text)
+            gate.on_member_refused = loop.refused_member
         servers, health_service = _make_servers(config, loop, metrics, gate)
         stun = await _start_stun(config, loop, cleanup)
         loop.update_metrics()

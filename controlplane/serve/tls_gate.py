@@ -183,7 +183,7 @@ class TlsGate:
         self._count = 0
         self._told: OrderedDict[tuple[NodeName, str], float] = OrderedDict()
         """When each refused member was last logged, by name and reason."""
-        self.on_member_refused: Callable[[NodeName, str], None] = lambda name, text: None
+        self.on_member_refused: Callable[[NodeName, CertificateError], None] = lambda name, error: None
         """Called, as seldom as the log, with the member whose certificate is not believed, and why."""
         self._log_lines = TokenBucket(rate=_LOG_LINES_PER_S, burst=_LOG_BURST, now=self._loop.time())
 
@@ -525,7 +525,7 @@ class TlsGate:
         if len(self._told) > MAX_LOGGED_REFUSALS:
             self._told.popitem(last=False)
         log.warning("refused a connection of %s: %s: %s", who, refusal.reason, refusal)
-        self.on_member_refused(name, f"connection: {refusal}")
+        self.on_member_refused(name, refusal)
 
     def _refused(self, who: str, reason: str, text: str) -> None:
         self._on_refused(reason)

@@ -93,9 +93,7 @@ controlplane/core/estimate/penalties.py
 controlplane/core/estimate/processing.py
 controlplane/core/explain/alternatives.py
 controlplane/core/explain/departed_explanation.py
-controlplane/core/explain/explanation.py
 controlplane/core/explain/fleet_view.py
-controlplane/core/explain/returning.py
 controlplane/core/explain/status.py
 controlplane/core/formulation/surplus.py
 controlplane/core/overload/postponed.py

@@ -512,6 +512,10 @@ class ControlCore:
         self._tell_revocations()
         self._judge(now)
 
+    def note_refused(self, name: NodeName, why: Why, text: str) -> None:
+        """Note that the connection of a member was refused for its certificate, which is no sign that it is gone."""
+        self._returning.is_refused(name, why, text)
+
     def remember(self, departures: Iterable[Departure], present: Iterable[Departure], now: float) -> None:
         """Remember what an earlier run knew: who was gone, and who was there; of these, those not back in time are
         gone."""

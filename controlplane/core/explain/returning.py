@@ -38,6 +38,8 @@ class Returning:
         """Servers that did not come back in time, and that are not believed to have been stopped."""
         self._witnesses: dict[NodeName, list[NodeName]] = {}
         """For awaited servers and those given up: robots that say that it said goodbye."""
+        self._refused: dict[NodeName, tuple[Why, str]] = {}
+        """Awaited members whose connection was refused for their certificate, why, and what was said of it."""
         self.until: float | None = None
         """When to ask who is `missing`; None while nobody is awaited."""
 
@@ -50,6 +52,7 @@ class Returning:
         self._awaited = {one.name: one for one in present}
         self._given_up.clear()
         self._witnesses.clear()
+        self._refused.clear()
         self.until = until if self._awaited else None
 
     def is_back(self, name: NodeName) -> None:
@@ -57,6 +60,12 @@ class Returning:
         self._awaited.pop(name, None)
         self._given_up.discard(name)
         self._witnesses.pop(name, None)
+        self._refused.pop(name, None)
+
+    def is_refused(self, name: NodeName, why: Why, text: str) -> None:
+        """Note that it came back, but that its connection was refused for its certificate."""
+        if name in self._awaited:
+            self._refused[name] = why, text
 
     def said_goodbye(self, server: NodeName, robot: NodeName) -> bool:
         """Note that a robot says so of a server; return whether that is news of one that was given up."""
@@ -91,10 +100,16 @@ class Returning:
         could_say = who_could_say()
         awaited, self._awaited = self._awaited, {}
         self.until = None
-        return [
-            self.judged(replace(one, at=now), could_say) if one.role is Role.CLOUD else replace(one, at=now, text=TEXT)
-            for one in awaited.values()
-        ]
+        refused, self._refused = self._refused, {}
+        return [self._missed(replace(one, at=now), refused.get(one.name), could_say) for one in awaited.values()]
+
+    def _missed(
+        self, gone: Departure, refused: tuple[Why, str] | None, could_say: Callable[[NodeName], int]
+    ) -> Departure:
+        if refused is not None:
+            why, text = refused
+            return replace(gone, why=why, text=f"it tries to come back, and is refused: {text}")
+        return self.judged(gone, could_say) if gone.role is Role.CLOUD else replace(gone, text=TEXT)
 
 
 def _named(robots: Collection[NodeName]) -> str:

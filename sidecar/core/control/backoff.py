@@ -17,13 +17,18 @@ class Backoff:
     def __init__(self, rng: random.Random, *, first_s: float, max_s: float) -> None:
         self._rng = rng
         self._first_s = first_s
-        self._max_s = max_s
+        self._max_s = self._refused_max_s = max_s
         self._bound_s = first_s
 
-    def next_delay_s(self) -> float:
-        """Return the delay before the next attempt, and double the bound."""
+    def next_delay_s(self, *, refused: bool = False) -> float:
+        """Return the delay before the next attempt, and double the bound.
+
+        `refused`: the last attempt was, and the next one soon will be as well. The bound then begins at its largest
+        value, and doubles beyond what `set_max` allows, up to what it was at first.
+        """
+        self._bound_s = max(self._bound_s, self._max_s) if refused else min(self._bound_s, self._max_s)
         delay_s = self._rng.uniform(0.0, self._bound_s)
-        self._bound_s = min(2.0 * self._bound_s, self._max_s)
+        self._bound_s = min(2.0 * self._bound_s, self._refused_max_s if refused else self._max_s)
         return delay_s
 
     def set_max(self, max_s: float) -> None:
@@ -34,7 +39,3 @@ class Backoff:
     def reset(self) -> None:
         """Start again from the first bound, as the last attempt went well."""
         self._bound_s = self._first_s
-
-    def exhaust(self) -> None:
-        """Continue from the largest bound, as trying again soon is useless."""
-        self._bound_s = self._max_s

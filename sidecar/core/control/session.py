@@ -225,8 +225,6 @@ class ControlSession:
         """
         if self.state is ControlState.ONLINE and now - self._opened_at >= STABLE_AFTER_S:
             self._backoff.reset()
-        if refused:
-            self._backoff.exhaust()
         if self._report is not None:
             self.stats.reports_dropped += 1
         if self.welcome_overdue(now):
@@ -234,7 +232,7 @@ class ControlSession:
         self._clear_outgoing()
         self.state = ControlState.OFFLINE
         self._refused = refused
-        delay_s = 0.0 if moved else self._backoff.next_delay_s()
+        delay_s = 0.0 if moved else self._backoff.next_delay_s(refused=refused)
         self._retry_at = now + delay_s
         return delay_s
 

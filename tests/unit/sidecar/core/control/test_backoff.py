@@ -17,8 +17,14 @@ def test_the_bound_doubles_up_to_the_largest_and_starts_over_after_a_reset() -> 
     assert [backoff.next_delay_s() for _ in range(5)] == [0.2, 0.4, 0.8, 1.0, 1.0]
     backoff.reset()
     assert backoff.next_delay_s() == 0.2
-    backoff.exhaust()
-    assert backoff.next_delay_s() == 1.0
+    assert backoff.next_delay_s(refused=True) == 1.0
+
+
+def test_who_is_refused_again_and_again_asks_ever_less_whatever_the_fleet_may() -> None:
+    backoff = Backoff(TopOfRange(), first_s=0.2, max_s=10.0)
+    backoff.set_max(1.0)
+    assert [backoff.next_delay_s(refused=True) for _ in range(6)] == [1.0, 2.0, 4.0, 8.0, 10.0, 10.0]
+    assert backoff.next_delay_s() == 1.0, "as soon as it is no longer refused"
 
 
 def test_delays_fill_their_range_so_that_a_fleet_spreads() -> None:
