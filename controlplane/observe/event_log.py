@@ -102,7 +102,8 @@ class EventLog:
         self._write_all = False
         self._closing = False
         self._file: IO[bytes] | None = None
-        self._lock: IO[bytes] | None = None
+        self._lock: int | None = None
+        """Descriptor of the lock file, or of the folder while that takes none."""
         self._writer: threading.Thread | None = None
         self.ran_until: float | None = None
         """When the previous run was last alive, in seconds since 1970; None if none is known."""
@@ -228,7 +229,8 @@ class EventLog:
 
     def _unlock(self) -> None:
         if self._lock is not None:
-            self._lock.close()
+            os.close(self._lock)
+            self._lock = None
         if self._folder is not None:
             self._folder.close()
 
@@ -237,7 +239,7 @@ class EventLog:
     def _open(self, path: Path) -> bool:
         try:
             self._folder = OwnFolder(path)
-            self._lock = self._open_to_append(LOCK_FILE)
+            self._lock = _open_lock(self._folder)
             fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
             self._problem = f"state_dir: another control plane uses {path}; give each a folder of its own"
@@ -248,7 +250,7 @@ class EventLog:
             return False
         assert self._lock is not None
         assert self._folder is not None
-        touched_at = os.fstat(self._lock.fileno()).st_mtime
+        touched_at = os.fstat(self._lock).st_mtime
         try:
             for event in self._read(self._folder):
                 self._memory.add(event)
@@ -267,7 +269,7 @@ class EventLog:
         # A failure here loses no event; the next run then takes the last event for the end of this one.
         with contextlib.suppress(OSError, ValueError):
             at = self._wall()
-            os.utime(self._lock.fileno(), (at, at))
+            os.utime(self._lock, (at, at))
 
     def _open_to_append(self, name: str) -> IO[bytes]:
         assert self._folder is not None
@@ -354,6 +356,21 @@ class EventLog:
         if self._file.tell() > MAX_EVENT_FILE_BYTES:
             with self._condition:
                 self._write_all = True
+
+
+def _open_lock(folder: OwnFolder) -> int:
+    """Return what keeps a second control plane out.
+
+    A disk that takes no file now, as it is full or read-only, still tells what was: later writes are tried again.
+    """
+    try:
+        return folder.open(LOCK_FILE, os.O_WRONLY | os.O_CREAT | os.O_APPEND)
+    except OSError as error:
+        if error.errno not in {errno.EROFS, errno.ENOSPC, errno.EDQUOT}:
+            raise
+    with contextlib.suppress(FileNotFoundError):
+        return folder.open(LOCK_FILE, os.O_RDONLY)
+    return folder.open_itself()
 
 
 def _in_order(events: list[FleetEvent]) -> list[FleetEvent]:

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import errno
+import fcntl
+import os
+import subprocess
 import threading
 import time
 from typing import IO, TYPE_CHECKING
@@ -194,6 +197,33 @@ def test_what_was_left_out_of_a_members_share_is_said(tmp_path: Path) -> None:
     assert f"and {left_out} earlier events" in log.events()[-1].text
 
 
+@pytest.mark.skipif(os.geteuid() != 0, reason="mounting takes root")
+@pytest.mark.parametrize("lock", [True, False])
+def test_a_folder_that_was_read_only_at_the_start_is_read_and_written_once_it_can_be(
+    tmp_path: Path, *, lock: bool
+) -> None:
+    folder = tmp_path / "state"
+    written = write(folder)
+    if not lock:
+        (folder / event_log.LOCK_FILE).unlink()
+    subprocess.run(["mount", "--bind", folder, folder], check=True)
+    try:
+        subprocess.run(["mount", "-o", "remount,ro,bind", folder], check=True)
+        log = EventLog(folder, retry_s=0.05)
+        assert [event.number for event in log.events()] == [event.number for event in written]
+        log.record(EventKind.STARTED)
+        wait_for(lambda: log.state.write_failures > 0)
+        assert not log.state.on_disk
+        subprocess.run(["mount", "-o", "remount,rw,bind", folder], check=True)
+        wait_for(lambda: log.state.on_disk)
+        log.close()
+        again = EventLog(folder)
+        assert len(again.events()) == len(written) + 1
+        again.close()
+    finally:
+        subprocess.run(["umount", folder], check=True)
+
+
 def flaps(log: EventLog, times: int) -> None:
     for _ in range(times):
         log.record(EventKind.STREAM_LOST, ROBOT, role=Role.ROBOT)
@@ -304,7 +334,7 @@ def test_it_knows_when_the_run_before_ended_also_if_nothing_happened_for_long(tm
     log._touch()
     # As after a kill: the file says no more, and another process may have the lock.
     assert log._lock is not None
-    log._lock.close()
+    fcntl.flock(log._lock, fcntl.LOCK_UN)
     wall += 60.0
     again = EventLog(tmp_path, wall=lambda: wall)
     assert again.ran_until == wall - 60.0
