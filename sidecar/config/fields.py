@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import fnmatch
 import re
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated
@@ -30,6 +31,8 @@ _SERVICE = re.compile(r"(/[A-Za-z_][A-Za-z0-9_]*)+")
 _SERVICE_TYPE = re.compile(r"[A-Za-z][A-Za-z0-9_]*/srv/[A-Za-z][A-Za-z0-9_]*")
 _SERVICE_GLOB = re.compile(r"[/*?\[][A-Za-z0-9_/*?\[\]!-]*")
 _GLOB_CHARACTERS = frozenset("*?[")
+_MATCHES_NO_NAME = (r"\[", "(?!)")
+"""In a translated glob: a bracket that nothing closes, and a range such as [z-a]."""
 _MAX_SERVICE_CHARACTERS = 255
 MAX_CONTROL_PLANES = 8
 """Maximum number of addresses of the control plane; each is tried over every interface."""
@@ -67,6 +70,8 @@ def _check_service(text: str) -> str:
     pattern = _SERVICE_GLOB if is_glob(text) else _SERVICE
     if len(text) > _MAX_SERVICE_CHARACTERS or not pattern.fullmatch(text):
         raise ValueError(f"expected a service name such as /plan_path or a glob such as /arm/*, got {text!r}")
+    if is_glob(text) and any(never in fnmatch.translate(text) for never in _MATCHES_NO_NAME):
+        raise ValueError(f"expected brackets such as [ab] or [a-z], got {text!r}")
     return text
 
 

@@ -87,6 +87,8 @@ BAD_VALUES: list[tuple[dict[str, Any], str, str]] = [
     (ROBOT | {"region": "eu"}, "region", "on a cloud only"),
     (CLOUD | {"region": "eu central"}, "region", "expected 1 to 63 letters"),
     (CLOUD | {"networks": [{"interface": "eth0"}]}, "networks", "on a robot only"),
+    (with_service(ROBOT, name="/arm/[z-a]"), "services[0].name", "expected brackets such as [ab] or [a-z]"),
+    (with_service(ROBOT, name="/arm/["), "services[0].name", "expected brackets such as [ab] or [a-z]"),
     (ROBOT | {"control_plane": "1:50051"}, "control_plane", "expected an IP address, got '1'"),
     (ROBOT | {"control_plane": "010.000.000.001:50051"}, "control_plane", "expected an IP address"),
     (ROBOT | {"control_plane": "224.0.0.1:50051"}, "control_plane", "not of a multicast group"),
