@@ -257,7 +257,7 @@ def test_what_the_operator_reads_of_a_sidecar_that_does_not_get_in(plane: Secure
     assert "it may not know our CA" in failure(plane.address, tmp_path / "other")
     past = Validity(now - 2 * HOUR_S, now - HOUR_S)
     future = Validity(now + HOUR_S, now + 2 * HOUR_S)
-    plane.authority.write_tls_dir(tmp_path / "robot", "robot-1", IdentityRole.ROBOT)
+    plane.authority.write_tls_dir(tmp_path / "robot", "robot-late", IdentityRole.ROBOT)
     for validity in (past, future):
         with expired_control_plane(plane.authority, validity) as address:
             assert "compare the clocks" in failure(address, tmp_path / "robot")

@@ -121,7 +121,7 @@ def test_a_member_that_has_not_heard_yet_of_the_end_of_its_stream_is_not_judged(
 
     monkeypatch.setattr(Line, "_end", end_and_look)
     day.run()
-    assert ends > 10
+    assert ends > 5
     assert [one for one in day.checker.complaints if "believes that it is registered" in one] == []
 
 
