@@ -6,7 +6,7 @@ import errno
 import os
 import time
 from collections import Counter
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -24,7 +24,7 @@ from plr.sidecar.doctor.running_checks import Pinged
 from plr.sidecar.local.client import LocalBusyError, LocalClient, LocalError, LocalRefusedError
 from plr.sidecar.local.protocol import MAX_REQUESTS_OF_CONNECTION
 from plr.sidecar.net.interfaces import choose, list_interfaces
-from plr.sidecar.ros import environment
+from plr.sidecar.ros import environment, shared_memory
 from plr.sidecar.ros.errors import RosBridgeError
 from plr.sidecar.state.file import MAX_STATE_FILE_BYTES, decode_clock_floor, decode_last_good
 from plr.sidecar.state.store import CLOCK_FILE, LAST_GOOD_FILE
@@ -255,8 +255,11 @@ def _ros(where: Where, config: SidecarConfig | None, state: dict[str, Any] | Non
     shell = dict(os.environ)
     if state is not None:
         # The sidecar has started, so its rclpy works; this shell may have a different one.
-        used = node_checks.running_environment(state.get("node") or {}, shell)
-        yield from node_checks.ros(used, shell, None)
+        node = state.get("node") or {}
+        used = node_checks.running_environment(node, shell)
+        others = shared_memory.users_of_domain(used)
+        of_unit = host.unit_environment(where.config).of_unit
+        yield from node_checks.ros(used, shell, None, of_unit=of_unit, user=node.get("user"), others=others)
         told = state.get("services") or {}
         yield from node_checks.types(told.get("carried") or {}, told.get("missing_types") or {})
         return
@@ -267,7 +270,15 @@ def _ros(where: Where, config: SidecarConfig | None, state: dict[str, Any] | Non
         )
         yield warn("ros", unit.refused, remedy)
     used = unit.variables
-    yield from node_checks.ros(used, shell, environment.problem(used, thorough=True))
+    wrong = environment.problem(used, thorough=True)
+    others = shared_memory.users_of_domain(used)
+    for one in node_checks.ros(used, shell, wrong, of_unit=unit.of_unit, user=unit.user, others=others):
+        known = unit.of_unit or one.check != "domain"
+        yield (
+            one
+            if known
+            else replace(one, text=f"{one.text} (the environment of this shell: no unit starts {where.config})")
+        )
     if config is not None:
         wanted = _types_last_offered(config)
         yield from node_checks.types(wanted, {name: kind for name, kind in wanted.items() if not _is_installed(kind)})

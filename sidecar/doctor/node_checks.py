@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 from plr.protos.program.certificate_term import term_problem
 from plr.protos.trust.clock_floor import SLACK_S
 from plr.sidecar.doctor.finding import duration, fail, ok, warn
+from plr.sidecar.ros import shared_memory
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
@@ -110,8 +111,19 @@ def clock(now_wall: float, floor: float, state: ClockState | None) -> Iterator[F
         yield ok("clock", f"kept by NTP, wrong by {state.error_s * 1000:.0f} ms at most")
 
 
-def ros(environment: Mapping[str, str], shell: Mapping[str, str], problem: str | None) -> Iterator[Finding]:
-    """Judge ROS by the sidecar's `environment`; `problem` is what `plr.sidecar.ros.environment` found."""
+def ros(
+    environment: Mapping[str, str],
+    shell: Mapping[str, str],
+    problem: str | None,
+    *,
+    of_unit: bool = False,
+    user: int | None = None,
+    others: frozenset[int] = frozenset(),
+) -> Iterator[Finding]:
+    """Judge ROS by the sidecar's `environment`; `problem` is what `plr.sidecar.ros.environment` found.
+
+    `of_unit`: whether a unit sets it. `user` runs the sidecar, and `others` run programs in its ROS domain.
+    """
     if problem is not None:
         remedy = (
             "correct the environment of the unit (/etc/plr/sidecar.env) or of this shell: docs/start/install.md, "
@@ -122,19 +134,32 @@ def ros(environment: Mapping[str, str], shell: Mapping[str, str], problem: str |
         yield ok(
             "ros", f"rclpy works, with {environment.get('RMW_IMPLEMENTATION') or 'rmw_fastrtps_cpp (the default)'}"
         )
+    yield _domain(environment, shell, of_unit, user, others)
+
+
+def _domain(
+    environment: Mapping[str, str], shell: Mapping[str, str], of_unit: bool, user: int | None, others: frozenset[int]
+) -> Finding:
     domain, here = (env.get("ROS_DOMAIN_ID") or "0" for env in (environment, shell))
     note = "" if domain == here else f" (this shell: {here}; programs started in it do not see the sidecar)"
-    reach = environment.get("ROS_AUTOMATIC_DISCOVERY_RANGE") or "SUBNET"
-    profile = environment.get("FASTRTPS_DEFAULT_PROFILES_FILE") or environment.get("FASTDDS_DEFAULT_PROFILES_FILE")
-    if reach in ("LOCALHOST", "OFF") or (profile and reach == "SYSTEM_DEFAULT"):
-        by = f", by {profile}" if reach == "SYSTEM_DEFAULT" else ""
-        yield ok("domain", f"ROS_DOMAIN_ID {domain}{note}, discovery {reach}{by}")
-    else:
-        yield warn(
-            "domain",
-            f"ROS_DOMAIN_ID {domain}{note}, discovery {reach}: ROS uses every network and bypasses the sidecar",
-            "set ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST (the unit uses a DDS profile instead)",
-        )
+    reach, profile = shared_memory.discovery_range(environment), shared_memory.profile(environment)
+    text = f"ROS_DOMAIN_ID {domain}{note}, discovery {reach}"
+    if reach == "OFF":
+        remedy = "remove ROS_AUTOMATIC_DISCOVERY_RANGE from /etc/plr/sidecar.env, or set LOCALHOST in this shell"
+        return fail("domain", f"{text}: ROS finds no other program, so no call is answered", remedy)
+    apart = None if user is None else shared_memory.problem(environment, user, others)
+    if apart is not None:
+        return (fail if others - {user} else warn)("domain", f"{text}: {apart}", shared_memory.REMEDY)
+    if reach == "LOCALHOST":
+        return ok("domain", text)
+    if profile and reach == "SYSTEM_DEFAULT":
+        return ok("domain", f"{text}, by {profile}")
+    remedy = (
+        "remove ROS_AUTOMATIC_DISCOVERY_RANGE from /etc/plr/sidecar.env, because the unit brings a DDS profile"
+        if of_unit and shared_memory.is_fast_dds(environment)
+        else "set ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST for the sidecar: docs/start/install.md, ROS on the host"
+    )
+    return warn("domain", f"{text}: ROS uses every network and bypasses the sidecar", remedy)
 
 
 def types(wanted: Mapping[str, str], missing: Mapping[str, str]) -> Iterator[Finding]:

@@ -48,6 +48,7 @@ class _Node(_Entry):
     version: Text = ""
     python: Text = ""
     pid: Whole = 0
+    user: Whole | None = None
     up_s: float = 0.0
     insecure: bool = False
     stun: bool = True

@@ -122,6 +122,7 @@ class LocalState:
             "version": self.version,
             "python": platform.python_version(),
             "pid": os.getpid(),
+            "user": os.geteuid(),
             "up_s": now - self.started_at,
             "insecure": config.insecure,
             "stun": config.stun.enabled,

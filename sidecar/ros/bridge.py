@@ -7,6 +7,7 @@ and it deserialises and sends what the data plane hands over. `handle` only queu
 from __future__ import annotations
 
 import logging
+import os
 import threading
 import time
 from typing import TYPE_CHECKING, Protocol
@@ -14,6 +15,7 @@ from typing import TYPE_CHECKING, Protocol
 from plr.protos.model.ids import Role
 from plr.sidecar.core.base.values import RejectReason
 from plr.sidecar.core.seam.application import ExecuteRequest
+from plr.sidecar.ros import shared_memory
 from plr.sidecar.ros.cloud.cloud_side import CloudSide
 from plr.sidecar.ros.event_queue import EventQueue
 from plr.sidecar.ros.graph.graph import sidecar_node_name
@@ -89,6 +91,9 @@ class RosBridge:
         self._loop = loop
         self._thread = threading.Thread(target=self._run, args=(loop, side, data_plane), name="plr-ros", daemon=True)
         log.info("joined ROS domain %d as %s", loop.domain_id, loop.node.get_fully_qualified_name())
+        apart = shared_memory.problem(os.environ, os.geteuid(), shared_memory.users_of_domain(os.environ))
+        if apart is not None:
+            log.warning("%s; do: %s", apart, shared_memory.REMEDY)
         self._thread.start()
 
     def stop(self, timeout: float = STOP_TIMEOUT_S) -> bool:
