@@ -257,6 +257,7 @@ class SidecarRuntime:
             data_plane=self._data_plane,
             interfaces=self._interfaces.views,
             idle=self._interfaces.in_use,
+            unopened=self._interfaces.unopened,
             control=self._control.view,
             bridge=lambda: self._bridge.stats,
             unmet=lambda: self._unmet.unmet,

@@ -167,7 +167,7 @@ def examine(where: Where, *, pinging: bool = True) -> Examination:
     now_wall = time.time()
     seen.findings += _certificate_and_clock(config, seen.state, now_wall)
     seen.findings += _ros(where, config, seen.state)
-    seen.findings += _interfaces(config)
+    seen.findings += _interfaces(config, seen.state)
     if seen.state is not None and client is not None:
         pings = _ping_all(client, seen.state) if pinging else {}
         seen.findings += _running(config, seen.state, pings)
@@ -304,13 +304,14 @@ def _is_installed(kind: str) -> bool:
     return True
 
 
-def _interfaces(config: SidecarConfig | None) -> Iterator[Finding]:
+def _interfaces(config: SidecarConfig | None, state: dict[str, Any] | None) -> Iterator[Finding]:
     try:
         choice = choose(list_interfaces(), None if config is None else config.interfaces)
     except OSError as error:
         yield warn("interface", f"cannot be listed: {error}", "check that netlink is allowed here")
         return
-    yield from node_checks.interfaces(choice)
+    used = None if state is None or config is None else {one.get("name") for one in state["interfaces"]}
+    yield from node_checks.interfaces(choice, used, (state or {}).get("unopened") or ())
     names = [one.name for one in choice.usable if one.kind != "loopback"]
     yield from node_checks.reverse_path({name: host.reverse_path_filter(name) for name in names})
 

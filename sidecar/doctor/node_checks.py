@@ -10,7 +10,7 @@ from plr.sidecar.doctor.finding import duration, fail, ok, warn
 from plr.sidecar.ros import shared_memory
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping
+    from collections.abc import Container, Iterator, Mapping
 
     from plr.protos.program.tls_files import TlsFiles
     from plr.protos.trust.identity import Identity
@@ -176,9 +176,23 @@ def types(wanted: Mapping[str, str], missing: Mapping[str, str]) -> Iterator[Fin
         yield ok("types", f"installed: {', '.join(there)}")
 
 
-def interfaces(choice: InterfaceChoice) -> Iterator[Finding]:
-    """Compare the configured interfaces with those that exist."""
+def interfaces(
+    choice: InterfaceChoice, used: Container[str] | None = None, unopened: Container[str] = ()
+) -> Iterator[Finding]:
+    """Compare the configured interfaces with those that exist, and with those that a running sidecar has `used`.
+
+    Those in `unopened` are reported elsewhere: the sidecar could not open their sockets.
+    """
     for one in choice.usable:
+        if one.name in unopened:
+            continue
+        if used is not None and one.name not in used:
+            yield warn(
+                "interface",
+                f"{one.name}: it could carry data, but the running sidecar does not use it",
+                "restart the sidecar if its configuration changed; its log says more: journalctl -u plr-sidecar",
+            )
+            continue
         routed = sorted({family for family, _ in one.gateways})
         routes = "default route over " + " and ".join(f"IPv{family}" for family in routed) if routed else ""
         yield ok(

@@ -195,6 +195,7 @@ _KINDS: dict[str, Any] = {
     "certificate": _Certificate,
     "interfaces": _Interface,
     "idle": list[Text],
+    "unopened": dict[Text, Text],
     "control": _Control,
     "services": _Services,
     "mapping": _Mapping,

@@ -65,6 +65,8 @@ class LocalState:
     interfaces: Callable[[], Iterable[InterfaceView]]
     idle: Callable[[], Mapping[InterfaceName, bool]]
     """Return the wanted interfaces, and whether each can carry something."""
+    unopened: Callable[[], Mapping[InterfaceName, str]]
+    """Return the interfaces whose sockets could not be opened, and why."""
     control: Callable[[], ControlView]
     bridge: Callable[[], BridgeStats]
     unmet: Callable[[], Iterable[str]]
@@ -86,6 +88,7 @@ class LocalState:
         for view in self.interfaces():
             yield "interfaces", _interface(view, now)
         yield "idle", [name for name, carries in self.idle().items() if not carries]
+        yield "unopened", dict(self.unopened())
         yield "control", self._control(now)
         yield from self._services(now)
         refused = self.data_plane.peer_trust.refused(MAX_REFUSED_PEERS)

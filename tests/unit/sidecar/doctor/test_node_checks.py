@@ -190,6 +190,13 @@ def test_interfaces(there: list[Interface], expected: list[Level]) -> None:
     assert levels(node_checks.interfaces(choose(there, ("wlan0", "wwan0")))) == expected
 
 
+def test_an_interface_that_the_sidecar_does_not_use_is_not_ok() -> None:
+    choice = choose([interface("wlan0"), interface("wwan0")], None)
+    assert levels(node_checks.interfaces(choice, {"wlan0", "wwan0"})) == [Level.OK, Level.OK]
+    assert levels(node_checks.interfaces(choice, {"wlan0"})) == [Level.OK, Level.WARN]
+    assert levels(node_checks.interfaces(choice, {"wlan0"}, {"wwan0": "taken"})) == [Level.OK]
+
+
 def test_the_reverse_path_filter(tmp_path: Path) -> None:
     assert levels(node_checks.reverse_path({"wlan0": 0, "wwan0": 2})) == [Level.OK]
     assert levels(node_checks.reverse_path({"wlan0": 1})) == [Level.OK]
