@@ -222,8 +222,10 @@ class SidecarRuntime:
         carrying = [name for name, carries in used.items() if carries]
         reached = "reached" if self._control.connected else "not reached"
         services = " ".join(sorted(self._bridge.stats.carried)) or "none"
+        problem = self._bridge.stats.not_started
         return (
-            f"{len(carrying)} of {len(used)} interfaces in use ({' '.join(sorted(carrying)) or 'none'}), "
+            (f"{problem}; " if problem else "")
+            + f"{len(carrying)} of {len(used)} interfaces in use ({' '.join(sorted(carrying)) or 'none'}), "
             f"control plane {reached}, services offered: {services}"
         )[:MAX_STATUS_CHARACTERS]
 

@@ -24,7 +24,7 @@ from plr.sidecar.doctor.running_checks import Pinged
 from plr.sidecar.local.client import LocalBusyError, LocalClient, LocalError, LocalRefusedError
 from plr.sidecar.local.protocol import MAX_REQUESTS_OF_CONNECTION
 from plr.sidecar.net.interfaces import choose, list_interfaces
-from plr.sidecar.ros import environment, shared_memory
+from plr.sidecar.ros import environment, shared_memory, static_peers
 from plr.sidecar.ros.errors import RosBridgeError
 from plr.sidecar.state.file import MAX_STATE_FILE_BYTES, decode_clock_floor, decode_last_good
 from plr.sidecar.state.store import CLOCK_FILE, LAST_GOOD_FILE
@@ -254,12 +254,14 @@ def _read_state(path: Path, decode: Callable[[bytes], T]) -> T | None:
 def _ros(where: Where, config: SidecarConfig | None, state: dict[str, Any] | None) -> Iterator[Finding]:
     shell = dict(os.environ)
     if state is not None:
-        # The sidecar has started, so its rclpy works; this shell may have a different one.
+        # The sidecar says whether its rclpy works; this shell may have a different one.
         node = state.get("node") or {}
         used = node_checks.running_environment(node, shell)
         others = shared_memory.users_of_domain(used)
         of_unit = host.unit_environment(where.config).of_unit
-        yield from node_checks.ros(used, shell, None, of_unit=of_unit, user=node.get("user"), others=others)
+        wrong = node.get("ros_problem") or None
+        yield from node_checks.static_peers(node.get("left_out_peers") or ())
+        yield from node_checks.ros(used, shell, wrong, of_unit=of_unit, user=node.get("user"), others=others)
         told = state.get("services") or {}
         yield from node_checks.types(told.get("carried") or {}, told.get("missing_types") or {})
         return
@@ -271,6 +273,7 @@ def _ros(where: Where, config: SidecarConfig | None, state: dict[str, Any] | Non
         yield warn("ros", unit.refused, remedy)
     used = unit.variables
     wrong = environment.problem(used, thorough=True)
+    yield from node_checks.static_peers(static_peers.unresolvable(used))
     others = shared_memory.users_of_domain(used)
     for one in node_checks.ros(used, shell, wrong, of_unit=unit.of_unit, user=unit.user, others=others):
         known = unit.of_unit or one.check != "domain"

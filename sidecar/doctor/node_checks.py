@@ -8,9 +8,11 @@ from plr.protos.program.certificate_term import term_problem
 from plr.protos.trust.clock_floor import SLACK_S
 from plr.sidecar.doctor.finding import duration, fail, ok, warn
 from plr.sidecar.ros import shared_memory
+from plr.sidecar.ros.environment import LAST_SECOND, SET_CLOCK, clock_problem
+from plr.sidecar.ros.static_peers import told
 
 if TYPE_CHECKING:
-    from collections.abc import Container, Iterator, Mapping
+    from collections.abc import Container, Iterable, Iterator, Mapping
 
     from plr.protos.program.tls_files import TlsFiles
     from plr.protos.trust.identity import Identity
@@ -93,7 +95,10 @@ def _left(identity: Identity, now_wall: float) -> str:
 
 def clock(now_wall: float, floor: float, state: ClockState | None) -> Iterator[Finding]:
     """Judge the host's clock by the newest time that the CA has signed (`floor`; 0: none known) and by NTP."""
-    set_it = "set it: timedatectl set-ntp true, or date -s"
+    set_it = SET_CLOCK
+    if now_wall >= LAST_SECOND:
+        yield fail("clock", clock_problem(now_wall).partition("; ")[0], set_it)
+        return
     if now_wall < floor - SLACK_S:
         yield fail(
             "clock", f"at least {duration(floor - now_wall)} behind the newest time that the CA has signed", set_it
@@ -160,6 +165,13 @@ def _domain(
         else "set ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST for the sidecar: docs/start/install.md, ROS on the host"
     )
     return warn("domain", f"{text}: ROS uses every network and bypasses the sidecar", remedy)
+
+
+def static_peers(left_out: Iterable[str]) -> Iterator[Finding]:
+    """Report hosts of ROS_STATIC_PEERS without an address, which the sidecar leaves out."""
+    if names := tuple(left_out):
+        text, _, remedy = told(names).partition("; ")
+        yield warn("ros", text, remedy)
 
 
 def types(wanted: Mapping[str, str], missing: Mapping[str, str]) -> Iterator[Finding]:

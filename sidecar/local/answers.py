@@ -52,6 +52,8 @@ class _Node(_Entry):
     up_s: float = 0.0
     insecure: bool = False
     stun: bool = True
+    ros_problem: Text = ""
+    left_out_peers: list[Text] = []
     environment: dict[Text, Text] = {}
 
 

@@ -117,7 +117,7 @@ class LocalState:
         self.data_plane.ping(path, number, size)
 
     def _node(self, now: float) -> dict[str, Any]:
-        config = self.config
+        config, bridge = self.config, self.bridge()
         return {
             "protocol": VERSION,
             "name": config.name,
@@ -129,6 +129,8 @@ class LocalState:
             "up_s": now - self.started_at,
             "insecure": config.insecure,
             "stun": config.stun.enabled,
+            "ros_problem": bridge.not_started,
+            "left_out_peers": list(bridge.left_out_peers),
             "environment": {name: _told(os.environ[name]) for name in ENVIRONMENT if name in os.environ},
         }
 

@@ -125,6 +125,17 @@ def test_the_clock(ahead_s: float, state: ClockState | None, level: Level) -> No
     assert levels(node_checks.clock(now(), now() + ahead_s, state)) == [level]
 
 
+def test_a_clock_that_ros_does_not_start_with() -> None:
+    finding = one(node_checks.clock(2177452801.0, 0.0, ClockState(True, 0.01)))
+    assert finding.level is Level.FAIL
+    assert finding.text == "the clock says 2039-01-01, and Fast DDS works only until 2038-01-19"
+
+
+def test_static_peers_that_are_left_out() -> None:
+    assert levels(node_checks.static_peers(["planner-host"])) == [Level.WARN]
+    assert levels(node_checks.static_peers(())) == []
+
+
 def test_ros() -> None:
     assert levels(node_checks.ros(LOCALHOST, LOCALHOST, None)) == [Level.OK, Level.OK]
     assert levels(node_checks.ros({}, {}, None)) == [Level.OK, Level.WARN]
