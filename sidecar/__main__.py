@@ -29,7 +29,7 @@ with extras.required("plr-sidecar", "sidecar"):
     from plr.protos.program.tls_files import load_tls_files
     from plr.protos.program.version_option import ShowVersion
     from plr.sidecar.config.sidecar import SidecarConfig, config_schema, load_config, refuse_exposed
-    from plr.sidecar.ros import environment
+    from plr.sidecar.ros import environment, static_peers
     from plr.sidecar.stop_request import StopRequest
 
 if TYPE_CHECKING:
@@ -84,6 +84,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             _warn_of_short_deadlines(config)
             _check_certificate(config)
             _check_ros(thorough=True)
+            _warn_of_unresolvable_peers()
             _warn_of_missing_types(config)
             sys.stdout.write(f"{escaped(str(options.config))}: ok\n")
             return EXIT_OK
@@ -137,6 +138,12 @@ def _check_ros(*, thorough: bool) -> None:
     problem = environment.problem(thorough=thorough)
     if problem is not None:
         raise ConfigError("", "", problem)
+
+
+def _warn_of_unresolvable_peers() -> None:
+    left_out = static_peers.unresolvable(os.environ)
+    if left_out:
+        sys.stderr.write(f"{PROGRAM}: warning: {escaped(static_peers.told(left_out))}\n")
 
 
 def _warn_of_missing_types(config: SidecarConfig) -> None:

@@ -222,8 +222,10 @@ class SidecarRuntime:
         carrying = [name for name, carries in used.items() if carries]
         reached = "reached" if self._control.connected else "not reached"
         services = " ".join(sorted(self._bridge.stats.carried)) or "none"
+        problem = self._bridge.stats.not_started
         return (
-            f"{len(carrying)} of {len(used)} interfaces in use ({' '.join(sorted(carrying)) or 'none'}), "
+            (f"{problem}; " if problem else "")
+            + f"{len(carrying)} of {len(used)} interfaces in use ({' '.join(sorted(carrying)) or 'none'}), "
             f"control plane {reached}, services offered: {services}"
         )[:MAX_STATUS_CHARACTERS]
 
@@ -257,6 +259,7 @@ class SidecarRuntime:
             data_plane=self._data_plane,
             interfaces=self._interfaces.views,
             idle=self._interfaces.in_use,
+            unopened=self._interfaces.unopened,
             control=self._control.view,
             bridge=lambda: self._bridge.stats,
             unmet=lambda: self._unmet.unmet,

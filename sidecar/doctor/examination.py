@@ -6,7 +6,7 @@ import errno
 import os
 import time
 from collections import Counter
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -24,7 +24,7 @@ from plr.sidecar.doctor.running_checks import Pinged
 from plr.sidecar.local.client import LocalBusyError, LocalClient, LocalError, LocalRefusedError
 from plr.sidecar.local.protocol import MAX_REQUESTS_OF_CONNECTION
 from plr.sidecar.net.interfaces import choose, list_interfaces
-from plr.sidecar.ros import environment
+from plr.sidecar.ros import environment, shared_memory, static_peers
 from plr.sidecar.ros.errors import RosBridgeError
 from plr.sidecar.state.file import MAX_STATE_FILE_BYTES, decode_clock_floor, decode_last_good
 from plr.sidecar.state.store import CLOCK_FILE, LAST_GOOD_FILE
@@ -167,7 +167,7 @@ def examine(where: Where, *, pinging: bool = True) -> Examination:
     now_wall = time.time()
     seen.findings += _certificate_and_clock(config, seen.state, now_wall)
     seen.findings += _ros(where, config, seen.state)
-    seen.findings += _interfaces(config)
+    seen.findings += _interfaces(config, seen.state)
     if seen.state is not None and client is not None:
         pings = _ping_all(client, seen.state) if pinging else {}
         seen.findings += _running(config, seen.state, pings)
@@ -254,9 +254,14 @@ def _read_state(path: Path, decode: Callable[[bytes], T]) -> T | None:
 def _ros(where: Where, config: SidecarConfig | None, state: dict[str, Any] | None) -> Iterator[Finding]:
     shell = dict(os.environ)
     if state is not None:
-        # The sidecar has started, so its rclpy works; this shell may have a different one.
-        used = node_checks.running_environment(state.get("node") or {}, shell)
-        yield from node_checks.ros(used, shell, None)
+        # The sidecar says whether its rclpy works; this shell may have a different one.
+        node = state.get("node") or {}
+        used = node_checks.running_environment(node, shell)
+        others = shared_memory.users_of_domain(used)
+        of_unit = host.unit_environment(where.config).of_unit
+        wrong = node.get("ros_problem") or None
+        yield from node_checks.static_peers(node.get("left_out_peers") or ())
+        yield from node_checks.ros(used, shell, wrong, of_unit=of_unit, user=node.get("user"), others=others)
         told = state.get("services") or {}
         yield from node_checks.types(told.get("carried") or {}, told.get("missing_types") or {})
         return
@@ -267,7 +272,16 @@ def _ros(where: Where, config: SidecarConfig | None, state: dict[str, Any] | Non
         )
         yield warn("ros", unit.refused, remedy)
     used = unit.variables
-    yield from node_checks.ros(used, shell, environment.problem(used, thorough=True))
+    wrong = environment.problem(used, thorough=True)
+    yield from node_checks.static_peers(static_peers.unresolvable(used))
+    others = shared_memory.users_of_domain(used)
+    for one in node_checks.ros(used, shell, wrong, of_unit=unit.of_unit, user=unit.user, others=others):
+        known = unit.of_unit or one.check != "domain"
+        yield (
+            one
+            if known
+            else replace(one, text=f"{one.text} (the environment of this shell: no unit starts {where.config})")
+        )
     if config is not None:
         wanted = _types_last_offered(config)
         yield from node_checks.types(wanted, {name: kind for name, kind in wanted.items() if not _is_installed(kind)})
@@ -293,13 +307,14 @@ def _is_installed(kind: str) -> bool:
     return True
 
 
-def _interfaces(config: SidecarConfig | None) -> Iterator[Finding]:
+def _interfaces(config: SidecarConfig | None, state: dict[str, Any] | None) -> Iterator[Finding]:
     try:
         choice = choose(list_interfaces(), None if config is None else config.interfaces)
     except OSError as error:
         yield warn("interface", f"cannot be listed: {error}", "check that netlink is allowed here")
         return
-    yield from node_checks.interfaces(choice)
+    used = None if state is None or config is None else {one.get("name") for one in state["interfaces"]}
+    yield from node_checks.interfaces(choice, used, (state or {}).get("unopened") or ())
     names = [one.name for one in choice.usable if one.kind != "loopback"]
     yield from node_checks.reverse_path({name: host.reverse_path_filter(name) for name in names})
 

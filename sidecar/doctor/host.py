@@ -3,24 +3,17 @@
 from __future__ import annotations
 
 import ctypes
-import errno
 import os
 import re
-import stat
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
 
-from plr.protos.program.regular_file import open_regular
-
-if TYPE_CHECKING:
-    from collections.abc import Container
+from plr.sidecar.config.unit import installed, read_trusted
 
 STA_UNSYNC = 0x0040
 CLOCK_KEPT_S = 16.0
 """The kernel's error bound grows to this if nothing disciplines the clock (ntp_adjtime(3): NTP_PHASE_LIMIT)."""
 ENVIRONMENT_FILE = "sidecar.env"
-MAX_ENVIRONMENT_BYTES = 1 << 16
 MAX_NAMES_CHARACTERS = 200
 CONF = Path("/proc/sys/net/ipv4/conf")
 
@@ -34,6 +27,12 @@ _TELLS_OF_ROS = frozenset(
     }
 )
 """Variables that name no file; PATH, PYTHONPATH, LD_PRELOAD, AMENT_PREFIX_PATH and many more can run code."""
+_OF_THE_SHELL = re.compile(
+    r"(ROS|RMW|FASTRTPS|FASTDDS|CYCLONEDDS|AMENT|COLCON)_.*|CYCLONEDDS_URI|PYTHONPATH|LD_LIBRARY_PATH|CMAKE_PREFIX_PATH"
+)
+"""Variables that steer ROS: a unit does not inherit them from a shell."""
+_NOT_TRIED = "ROS_LOG_DIR"
+"""Belongs to the service's user: this one may not write there."""
 _PLAIN_VALUE = re.compile(r"[A-Za-z0-9_.:;, -]*")
 
 
@@ -92,23 +91,39 @@ class UnitEnvironment:
 
     variables: dict[str, str]
     refused: str = ""
-    """Parts of `sidecar.env` that are not used, and why; empty if all are used."""
+    """Parts of `sidecar.env` or the unit that are not used, and why; empty if all are used."""
+    of_unit: bool = False
+    """Whether there is a unit for this configuration; if not, this shell's environment is the base."""
+    user: int | None = None
+    """As whom the unit starts the sidecar."""
 
 
 def unit_environment(config: Path) -> UnitEnvironment:
-    """Read `sidecar.env` beside the configuration; it overrides this shell's environment.
+    """Read `Environment=` of the installed unit and `sidecar.env` beside the configuration, which overrides it.
 
-    A program is run with it, so it is used only if nobody but root, this user, or the configuration's owner can have
-    written it. From the last, only plain ROS settings are taken: the owner must not run code as this user.
+    Without a unit that starts this configuration, `sidecar.env` overrides this shell's environment.
+
+    A program is run with them, so a file is used only if nobody but root, this user, or the configuration's owner can
+    have written it; the unit only if it is root's. From the configuration's owner, only plain ROS settings are taken:
+    he must not run code as this user.
     """
-    environment = dict(os.environ)
+    unit = installed(config)
+    if unit is None:
+        return _with_file(config, UnitEnvironment(dict(os.environ)))
+    variables = {name: value for name, value in os.environ.items() if not _OF_THE_SHELL.fullmatch(name)}
+    variables |= {name: value for name, value in unit.environment.items() if name != _NOT_TRIED}
+    return _with_file(config, UnitEnvironment(variables, unit.unread, of_unit=True, user=unit.user_id))
+
+
+def _with_file(config: Path, base: UnitEnvironment) -> UnitEnvironment:
+    environment = dict(base.variables)
     path = config.with_name(ENVIRONMENT_FILE)
     try:
-        owner, text = _read_trusted(path, {0, os.geteuid(), config.stat().st_uid})
+        owner, text = read_trusted(path, {0, os.geteuid(), config.stat().st_uid})
     except FileNotFoundError:
-        return UnitEnvironment(environment)
+        return base
     except (OSError, ValueError) as error:
-        return UnitEnvironment(environment, f"{path} is not used: {getattr(error, 'strerror', None) or error}")
+        return replace(base, refused=f"{path} is not used: {getattr(error, 'strerror', None) or error}")
     foreign = owner not in (0, os.geteuid())
     refused = set()
     for line in text.splitlines():
@@ -121,29 +136,7 @@ def unit_environment(config: Path) -> UnitEnvironment:
         else:
             environment[key] = value
     if not refused:
-        return UnitEnvironment(environment)
+        return replace(base, variables=environment)
     names = " ".join(sorted(refused))[:MAX_NAMES_CHARACTERS]
-    return UnitEnvironment(environment, f"{path} belongs to user {owner}; these variables in it are not used: {names}")
-
-
-def _read_trusted(path: Path, owners: Container[int]) -> tuple[int, str]:
-    """Return owner and text of a file that only `owners` can have written; raise OSError or ValueError."""
-    folder = os.open(path.parent, os.O_PATH | os.O_DIRECTORY | os.O_CLOEXEC)
-    try:
-        with open_regular(Path(path.name), folder=folder) as file:
-            _refuse_untrusted("its folder", os.fstat(folder), owners)
-            status = os.fstat(file.fileno())
-            _refuse_untrusted("it", status, owners)
-            data = file.read(MAX_ENVIRONMENT_BYTES)
-            if b"\0" in data:
-                raise OSError(errno.EINVAL, "it contains a NUL byte, as after a power cut: write it again")
-            return status.st_uid, data.decode()
-    finally:
-        os.close(folder)
-
-
-def _refuse_untrusted(what: str, status: os.stat_result, owners: Container[int]) -> None:
-    if status.st_uid not in owners:
-        raise OSError(errno.EPERM, f"{what} belongs to user {status.st_uid}, who is not the configuration's owner")
-    if status.st_mode & (stat.S_IWGRP | stat.S_IWOTH):
-        raise OSError(errno.EPERM, f"others may write to {what}: chmod go-w")
+    told = f"{path} belongs to user {owner}; these variables in it are not used: {names}"
+    return replace(base, variables=environment, refused=told)

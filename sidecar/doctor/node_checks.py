@@ -7,9 +7,12 @@ from typing import TYPE_CHECKING, Any
 from plr.protos.program.certificate_term import term_problem
 from plr.protos.trust.clock_floor import SLACK_S
 from plr.sidecar.doctor.finding import duration, fail, ok, warn
+from plr.sidecar.ros import shared_memory
+from plr.sidecar.ros.environment import LAST_SECOND, SET_CLOCK, clock_problem
+from plr.sidecar.ros.static_peers import told
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping
+    from collections.abc import Container, Iterable, Iterator, Mapping
 
     from plr.protos.program.tls_files import TlsFiles
     from plr.protos.trust.identity import Identity
@@ -92,7 +95,10 @@ def _left(identity: Identity, now_wall: float) -> str:
 
 def clock(now_wall: float, floor: float, state: ClockState | None) -> Iterator[Finding]:
     """Judge the host's clock by the newest time that the CA has signed (`floor`; 0: none known) and by NTP."""
-    set_it = "set it: timedatectl set-ntp true, or date -s"
+    set_it = SET_CLOCK
+    if now_wall >= LAST_SECOND:
+        yield fail("clock", clock_problem(now_wall).partition("; ")[0], set_it)
+        return
     if now_wall < floor - SLACK_S:
         yield fail(
             "clock", f"at least {duration(floor - now_wall)} behind the newest time that the CA has signed", set_it
@@ -110,8 +116,19 @@ def clock(now_wall: float, floor: float, state: ClockState | None) -> Iterator[F
         yield ok("clock", f"kept by NTP, wrong by {state.error_s * 1000:.0f} ms at most")
 
 
-def ros(environment: Mapping[str, str], shell: Mapping[str, str], problem: str | None) -> Iterator[Finding]:
-    """Judge ROS by the sidecar's `environment`; `problem` is what `plr.sidecar.ros.environment` found."""
+def ros(
+    environment: Mapping[str, str],
+    shell: Mapping[str, str],
+    problem: str | None,
+    *,
+    of_unit: bool = False,
+    user: int | None = None,
+    others: frozenset[int] = frozenset(),
+) -> Iterator[Finding]:
+    """Judge ROS by the sidecar's `environment`; `problem` is what `plr.sidecar.ros.environment` found.
+
+    `of_unit`: whether a unit sets it. `user` runs the sidecar, and `others` run programs in its ROS domain.
+    """
     if problem is not None:
         remedy = (
             "correct the environment of the unit (/etc/plr/sidecar.env) or of this shell: docs/start/install.md, "
@@ -122,19 +139,39 @@ def ros(environment: Mapping[str, str], shell: Mapping[str, str], problem: str |
         yield ok(
             "ros", f"rclpy works, with {environment.get('RMW_IMPLEMENTATION') or 'rmw_fastrtps_cpp (the default)'}"
         )
+    yield _domain(environment, shell, of_unit, user, others)
+
+
+def _domain(
+    environment: Mapping[str, str], shell: Mapping[str, str], of_unit: bool, user: int | None, others: frozenset[int]
+) -> Finding:
     domain, here = (env.get("ROS_DOMAIN_ID") or "0" for env in (environment, shell))
     note = "" if domain == here else f" (this shell: {here}; programs started in it do not see the sidecar)"
-    reach = environment.get("ROS_AUTOMATIC_DISCOVERY_RANGE") or "SUBNET"
-    profile = environment.get("FASTRTPS_DEFAULT_PROFILES_FILE") or environment.get("FASTDDS_DEFAULT_PROFILES_FILE")
-    if reach in ("LOCALHOST", "OFF") or (profile and reach == "SYSTEM_DEFAULT"):
-        by = f", by {profile}" if reach == "SYSTEM_DEFAULT" else ""
-        yield ok("domain", f"ROS_DOMAIN_ID {domain}{note}, discovery {reach}{by}")
-    else:
-        yield warn(
-            "domain",
-            f"ROS_DOMAIN_ID {domain}{note}, discovery {reach}: ROS uses every network and bypasses the sidecar",
-            "set ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST (the unit uses a DDS profile instead)",
-        )
+    reach, profile = shared_memory.discovery_range(environment), shared_memory.profile(environment)
+    text = f"ROS_DOMAIN_ID {domain}{note}, discovery {reach}"
+    if reach == "OFF":
+        remedy = "remove ROS_AUTOMATIC_DISCOVERY_RANGE from /etc/plr/sidecar.env, or set LOCALHOST in this shell"
+        return fail("domain", f"{text}: ROS finds no other program, so no call is answered", remedy)
+    apart = None if user is None else shared_memory.problem(environment, user, others)
+    if apart is not None:
+        return (fail if others - {user} else warn)("domain", f"{text}: {apart}", shared_memory.REMEDY)
+    if reach == "LOCALHOST":
+        return ok("domain", text)
+    if profile and reach == "SYSTEM_DEFAULT":
+        return ok("domain", f"{text}, by {profile}")
+    remedy = (
+        "remove ROS_AUTOMATIC_DISCOVERY_RANGE from /etc/plr/sidecar.env, because the unit brings a DDS profile"
+        if of_unit and shared_memory.is_fast_dds(environment)
+        else "set ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST for the sidecar: docs/start/install.md, ROS on the host"
+    )
+    return warn("domain", f"{text}: ROS uses every network and bypasses the sidecar", remedy)
+
+
+def static_peers(left_out: Iterable[str]) -> Iterator[Finding]:
+    """Report hosts of ROS_STATIC_PEERS without an address, which the sidecar leaves out."""
+    if names := tuple(left_out):
+        text, _, remedy = told(names).partition("; ")
+        yield warn("ros", text, remedy)
 
 
 def types(wanted: Mapping[str, str], missing: Mapping[str, str]) -> Iterator[Finding]:
@@ -151,9 +188,23 @@ def types(wanted: Mapping[str, str], missing: Mapping[str, str]) -> Iterator[Fin
         yield ok("types", f"installed: {', '.join(there)}")
 
 
-def interfaces(choice: InterfaceChoice) -> Iterator[Finding]:
-    """Compare the configured interfaces with those that exist."""
+def interfaces(
+    choice: InterfaceChoice, used: Container[str] | None = None, unopened: Container[str] = ()
+) -> Iterator[Finding]:
+    """Compare the configured interfaces with those that exist, and with those that a running sidecar has `used`.
+
+    Those in `unopened` are reported elsewhere: the sidecar could not open their sockets.
+    """
     for one in choice.usable:
+        if one.name in unopened:
+            continue
+        if used is not None and one.name not in used:
+            yield warn(
+                "interface",
+                f"{one.name}: it could carry data, but the running sidecar does not use it",
+                "restart the sidecar if its configuration changed; its log says more: journalctl -u plr-sidecar",
+            )
+            continue
         routed = sorted({family for family, _ in one.gateways})
         routes = "default route over " + " and ".join(f"IPv{family}" for family in routed) if routed else ""
         yield ok(

@@ -5,6 +5,8 @@
 
 from __future__ import annotations
 
+import errno
+import os
 from dataclasses import dataclass, field
 from ipaddress import ip_address, ip_network
 from typing import TYPE_CHECKING, Any
@@ -144,7 +146,14 @@ def _shown(host: str, port: int) -> str:
 
 
 def devices(state: State) -> Iterator[Finding]:
-    """Report oddities of the sockets and drivers of interfaces."""
+    """Report interfaces without a socket, and oddities of sockets and drivers."""
+    for name, why in sorted((state.get("unopened") or {}).items()):
+        remedy = (
+            "find the program that has the port: sudo ss -ulnp; end it, or choose another udp_port"
+            if os.strerror(errno.EADDRINUSE) in why
+            else "see docs/operate/troubleshooting.md, An interface is not used; the sidecar tries again"
+        )
+        yield fail("interface", f"{name}: {why}", remedy)
     for interface in state["interfaces"]:
         if interface.get("bound_to") == "address":
             yield warn(

@@ -48,9 +48,12 @@ class _Node(_Entry):
     version: Text = ""
     python: Text = ""
     pid: Whole = 0
+    user: Whole | None = None
     up_s: float = 0.0
     insecure: bool = False
     stun: bool = True
+    ros_problem: Text = ""
+    left_out_peers: list[Text] = []
     environment: dict[Text, Text] = {}
 
 
@@ -194,6 +197,7 @@ _KINDS: dict[str, Any] = {
     "certificate": _Certificate,
     "interfaces": _Interface,
     "idle": list[Text],
+    "unopened": dict[Text, Text],
     "control": _Control,
     "services": _Services,
     "mapping": _Mapping,

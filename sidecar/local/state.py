@@ -65,6 +65,8 @@ class LocalState:
     interfaces: Callable[[], Iterable[InterfaceView]]
     idle: Callable[[], Mapping[InterfaceName, bool]]
     """Return the wanted interfaces, and whether each can carry something."""
+    unopened: Callable[[], Mapping[InterfaceName, str]]
+    """Return the interfaces whose sockets could not be opened, and why."""
     control: Callable[[], ControlView]
     bridge: Callable[[], BridgeStats]
     unmet: Callable[[], Iterable[str]]
@@ -86,6 +88,7 @@ class LocalState:
         for view in self.interfaces():
             yield "interfaces", _interface(view, now)
         yield "idle", [name for name, carries in self.idle().items() if not carries]
+        yield "unopened", dict(self.unopened())
         yield "control", self._control(now)
         yield from self._services(now)
         refused = self.data_plane.peer_trust.refused(MAX_REFUSED_PEERS)
@@ -114,7 +117,7 @@ class LocalState:
         self.data_plane.ping(path, number, size)
 
     def _node(self, now: float) -> dict[str, Any]:
-        config = self.config
+        config, bridge = self.config, self.bridge()
         return {
             "protocol": VERSION,
             "name": config.name,
@@ -122,9 +125,12 @@ class LocalState:
             "version": self.version,
             "python": platform.python_version(),
             "pid": os.getpid(),
+            "user": os.geteuid(),
             "up_s": now - self.started_at,
             "insecure": config.insecure,
             "stun": config.stun.enabled,
+            "ros_problem": bridge.not_started,
+            "left_out_peers": list(bridge.left_out_peers),
             "environment": {name: _told(os.environ[name]) for name in ENVIRONMENT if name in os.environ},
         }
 

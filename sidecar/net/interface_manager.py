@@ -102,7 +102,8 @@ class InterfaceManager:
         self._idle: frozenset[InterfaceName] = frozenset()
         """Wanted interfaces that were missing or could carry nothing at the last scan."""
         self._warned = False
-        self._socket_refused = False
+        self._refused: dict[InterfaceName, str] = {}
+        """Usable interfaces whose sockets could not be opened at the last scan, and why. Replaced, never changed."""
         self._lock = threading.Lock()
         """Guards the addresses, which the interfaces' threads report."""
         self._watch = NetlinkWatch()
@@ -149,8 +150,12 @@ class InterfaceManager:
 
     def in_use(self) -> dict[InterfaceName, bool]:
         """Return the interfaces that are wanted, and whether each can carry something; from any thread."""
-        states = dict.fromkeys(self._idle, False)
+        states = dict.fromkeys([*self._idle, *self._refused], False)
         return states | {name: not managed.suspended for name, managed in list(self._managed.items())}
+
+    def unopened(self) -> dict[InterfaceName, str]:
+        """Return the interfaces whose sockets could not be opened, and why; from any thread."""
+        return self._refused
 
     def views(self) -> list[InterfaceView]:
         """Return the state of the interfaces in use; from any thread."""
@@ -247,12 +252,12 @@ class InterfaceManager:
         choice = choose(list_interfaces(), self._config.interfaces)
         self._log_skipped(choice)
         self._drop_gone(choice)
-        self._socket_refused = False
         changed = added = False
+        refused: dict[InterfaceName, str] = {}
         for interface in choice.usable:
             managed = self._managed.get(interface.name)
             if managed is None:
-                added |= self._add(interface)
+                added |= self._add(interface, refused)
             else:
                 changed |= self._update(managed, interface)
         if added:
@@ -261,10 +266,11 @@ class InterfaceManager:
             self._resolver.look_up(self._stun_names)  # this network's DNS may know what the last one did not
         idle = {skipped.name for skipped in choice.skipped if skipped.wanted}
         self._idle = frozenset(idle.union(map(InterfaceName, choice.missing)))
+        self._refused = refused
         self._warn_when_none(choice)
         self._publish_candidates()
         self._schedule.scanned(started, time.monotonic())
-        if self._socket_refused:
+        if refused:
             self._schedule.failed(time.monotonic())
 
     def _drop_gone(self, choice: InterfaceChoice) -> None:
@@ -291,7 +297,8 @@ class InterfaceManager:
         for managed in gone:
             self._numbers[managed.name].memory = managed.stop()
 
-    def _add(self, interface: Interface) -> bool:
+    def _add(self, interface: Interface, refused: dict[InterfaceName, str]) -> bool:
+        """Use an interface and return True; if its socket cannot be opened, note why in `refused`."""
         number = self._number(interface.name)
         if number is None:
             return False
@@ -310,8 +317,11 @@ class InterfaceManager:
                     self._on_stun,
                 )
             except OSError as error:
-                self._socket_refused = True
-                self._log_skipped_once(interface.name, f"its socket could not be opened: {error}")
+                why = f"its socket could not be opened: {error.strerror or error}"
+                if self._config.udp_port:
+                    why += f" (udp_port {self._config.udp_port})"
+                refused[interface.name] = why
+                self._log_skipped_once(interface.name, why)
                 return False
             self._managed[interface.name] = managed
             if self._readiness.add(interface.name, interface.families, time.monotonic()):
@@ -356,6 +366,7 @@ class InterfaceManager:
         if none and not self._warned:
             reasons = [f"{interface.name}: {interface.reason}" for interface in choice.skipped]
             reasons += [f"{name}: there is no such interface" for name in choice.missing]
+            reasons += [f"{name}: {why}" for name, why in self._refused.items()]
             log.warning(
                 "no interface is in use, so no request can be carried (%s)", "; ".join(reasons) or "there are none"
             )
@@ -386,7 +397,7 @@ class InterfaceManager:
         A port that was never plugged in is no problem where all interfaces are used, or a glob matches it.
         """
         named = self._config.interfaces or ()
-        idle = {name for name in self._idle if name in named or name in self._numbers}
+        idle = {name for name in (*self._idle, *self._refused) if name in named or name in self._numbers}
         suspended = {name for name, managed in self._managed.items() if managed.suspended}
         return tuple(sorted(idle | suspended))
 

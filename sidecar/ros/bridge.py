@@ -7,6 +7,7 @@ and it deserialises and sends what the data plane hands over. `handle` only queu
 from __future__ import annotations
 
 import logging
+import os
 import threading
 import time
 from typing import TYPE_CHECKING, Protocol
@@ -14,7 +15,9 @@ from typing import TYPE_CHECKING, Protocol
 from plr.protos.model.ids import Role
 from plr.sidecar.core.base.values import RejectReason
 from plr.sidecar.core.seam.application import ExecuteRequest
+from plr.sidecar.ros import shared_memory, static_peers
 from plr.sidecar.ros.cloud.cloud_side import CloudSide
+from plr.sidecar.ros.errors import RosStartError
 from plr.sidecar.ros.event_queue import EventQueue
 from plr.sidecar.ros.graph.graph import sidecar_node_name
 from plr.sidecar.ros.graph.scans import Scans
@@ -35,6 +38,8 @@ DRAIN_S = 0.005
 """Time the ROS thread spends on the data plane's events before it takes the servers' answers again."""
 STOP_TIMEOUT_S = 5.0
 """Destroying some hundred DDS endpoints takes less than a second."""
+START_AGAIN_S = 5.0
+"""How often ROS is started again while it does not start, for example because of a wrong clock."""
 _ERROR_PAUSE_S = 0.1
 """Pause after the wait itself failed, so that a broken rmw does not burn a core."""
 
@@ -67,6 +72,7 @@ class RosBridge:
         self._domain_id = domain_id
         self._events = EventQueue()
         self._stopping = False
+        self._stop_asked = threading.Event()
         self._loop: RosLoop | None = None
         self._thread: threading.Thread | None = None
         self._limited = LimitedLog(log)
@@ -77,23 +83,18 @@ class RosBridge:
         return self._thread is not None and self._thread.is_alive()
 
     def start(self, data_plane: DataPlane) -> None:
-        """Join the ROS domain and start the ROS thread; raise rclpy's RCLError when rmw cannot start."""
+        """Join the ROS domain and start the ROS thread, which tries again if ROS does not start now."""
         if self._thread is not None:
             raise RuntimeError("the bridge has already been started")
-        loop = RosLoop(sidecar_node_name(self.name), self._domain_id)
-        try:
-            side = self._make_side(loop, data_plane)
-        except BaseException:
-            loop.close()
-            raise
-        self._loop = loop
-        self._thread = threading.Thread(target=self._run, args=(loop, side, data_plane), name="plr-ros", daemon=True)
-        log.info("joined ROS domain %d as %s", loop.domain_id, loop.node.get_fully_qualified_name())
+        self._leave_out_peers()
+        joined = self._join(data_plane)
+        self._thread = threading.Thread(target=self._run, args=(data_plane, joined), name="plr-ros", daemon=True)
         self._thread.start()
 
     def stop(self, timeout: float = STOP_TIMEOUT_S) -> bool:
         """Withdraw everything and leave the domain; return True if that took at most `timeout` seconds."""
         self._stopping = True
+        self._stop_asked.set()
         if self._loop is not None:
             self._loop.wake()
         if self._thread is None:
@@ -110,6 +111,34 @@ class RosBridge:
         loop = self._loop
         if loop is not None and not self._stopping:
             loop.wake()
+
+    def _leave_out_peers(self) -> None:
+        self.stats.left_out_peers = static_peers.unresolvable(os.environ)
+        if self.stats.left_out_peers:
+            log.warning("%s", static_peers.told(self.stats.left_out_peers))
+            os.environ.update(static_peers.without(os.environ, self.stats.left_out_peers))
+
+    def _join(self, data_plane: DataPlane) -> tuple[RosLoop, _Side] | None:
+        """Join the ROS domain; return None if ROS does not start now, which is logged once."""
+        try:
+            loop = RosLoop(sidecar_node_name(self.name), self._domain_id)
+        except RosStartError as error:
+            if self.stats.not_started != str(error):
+                log.error("%s (tried again every %g s; until then no service is carried)", error, START_AGAIN_S)
+            self.stats.not_started = str(error)
+            return None
+        try:
+            side = self._make_side(loop, data_plane)
+        except BaseException:
+            loop.close()
+            raise
+        self.stats.not_started = ""
+        self._loop = loop
+        log.info("joined ROS domain %d as %s", loop.domain_id, loop.node.get_fully_qualified_name())
+        apart = shared_memory.problem(os.environ, os.geteuid(), shared_memory.users_of_domain(os.environ))
+        if apart is not None:
+            log.warning("%s; do: %s", apart, shared_memory.REMEDY)
+        return loop, side
 
     # -- the ROS thread --------------------------------------------------------------------------------------------
 
@@ -128,7 +157,13 @@ class RosBridge:
             loop=loop, rules=self._rules, data_plane=data_plane, stats=self.stats, limited_log=self._limited
         )
 
-    def _run(self, loop: RosLoop, side: _Side, data_plane: DataPlane) -> None:
+    def _run(self, data_plane: DataPlane, joined: tuple[RosLoop, _Side] | None) -> None:
+        while joined is None:
+            if self._stop_asked.wait(START_AGAIN_S):
+                self._refuse_queued(data_plane)
+                return
+            joined = self._join(data_plane)
+        loop, side = joined
         scans = Scans(side.scan, side.settling, time.monotonic())
         while not self._stopping:
             try:

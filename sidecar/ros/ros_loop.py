@@ -7,6 +7,7 @@ EventsExecutor starves the other threads of the process (docs/develop/adr/0007-o
 from __future__ import annotations
 
 import contextlib
+import time
 from typing import TYPE_CHECKING, Any, Protocol
 
 import rclpy
@@ -17,6 +18,8 @@ from rclpy.parameter import Parameter
 from rclpy.qos import QoSProfile, qos_profile_services_default
 from rclpy.signals import SignalHandlerOptions
 
+from plr.sidecar.ros.environment import not_started
+from plr.sidecar.ros.errors import RosStartError
 from plr.sidecar.ros.rcl import graph_guard, wait_for_guard
 
 if TYPE_CHECKING:
@@ -48,24 +51,13 @@ class RosLoop:
     """Context, node and wait set. All methods but `wake` belong to one thread."""
 
     def __init__(self, node_name: str, domain_id: int | None) -> None:
+        """Join the domain; raise RosStartError if rmw cannot now."""
         self._context = Context()
-        # A separate context without rclpy's signal handlers and the command line: both belong to the program.
-        # No ROS log file either: it would need a writable home directory.
-        rclpy.init(
-            args=["--ros-args", "--disable-external-lib-logs"],
-            context=self._context,
-            domain_id=domain_id,
-            signal_handler_options=SignalHandlerOptions.NO,
-        )
-        self.node = Node(
-            node_name,
-            context=self._context,
-            use_global_arguments=False,
-            enable_rosout=False,
-            start_parameter_services=False,
-            # The node offers nothing under its own name.
-            parameter_overrides=[Parameter("start_type_description_service", value=False)],
-        )
+        try:
+            self.node = self._join(node_name, domain_id)
+        except (_rclpy.RCLError, _rclpy.RMWError) as error:
+            self._context.try_shutdown()
+            raise RosStartError(not_started(str(error), time.time())) from error
         self._guard = _rclpy.GuardCondition(self._context.handle)
         self._graph_guard = graph_guard(self.node.handle.pointer)
         self.graph_changed = False
@@ -75,6 +67,25 @@ class RosLoop:
         self._by_pointer: dict[int, Waited] = {}
         self._wait_set: Any = None
         self._woken = False
+
+    def _join(self, node_name: str, domain_id: int | None) -> Node:
+        # A separate context without rclpy's signal handlers and the command line: both belong to the program.
+        # No ROS log file either: it would need a writable home directory.
+        rclpy.init(
+            args=["--ros-args", "--disable-external-lib-logs"],
+            context=self._context,
+            domain_id=domain_id,
+            signal_handler_options=SignalHandlerOptions.NO,
+        )
+        return Node(
+            node_name,
+            context=self._context,
+            use_global_arguments=False,
+            enable_rosout=False,
+            start_parameter_services=False,
+            # The node offers nothing under its own name.
+            parameter_overrides=[Parameter("start_type_description_service", value=False)],
+        )
 
     @property
     def domain_id(self) -> int:

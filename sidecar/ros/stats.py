@@ -60,3 +60,7 @@ class BridgeStats:
     """Cloud: services all of whose servers in the ROS graph ended or show no sign of life."""
     carried: frozenset[ServiceName] = frozenset()
     """Robot: proxied services that exist. Cloud: services offered to robots."""
+    not_started: str = ""
+    """Why ROS does not start, while it is tried again; empty otherwise."""
+    left_out_peers: tuple[str, ...] = ()
+    """Hosts of ROS_STATIC_PEERS without an address at the start."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import time
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import pytest
@@ -12,14 +13,14 @@ from plr.controlplane.ca import Authority
 from plr.protos.model.ids import InterfaceName
 from plr.protos.program.tls_files import load_tls_files
 from plr.protos.trust.identity import IdentityRole
-from plr.sidecar.doctor import node_checks
+from plr.sidecar.config.unit import installed
+from plr.sidecar.doctor import host, node_checks
 from plr.sidecar.doctor.finding import Finding, Level
 from plr.sidecar.doctor.host import ClockState, reverse_path_filter, unit_environment
 from plr.sidecar.net.interfaces import Interface, choose
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
-    from pathlib import Path
 
 pytestmark = pytest.mark.audit("ops-14")
 
@@ -124,6 +125,17 @@ def test_the_clock(ahead_s: float, state: ClockState | None, level: Level) -> No
     assert levels(node_checks.clock(now(), now() + ahead_s, state)) == [level]
 
 
+def test_a_clock_that_ros_does_not_start_with() -> None:
+    finding = one(node_checks.clock(2177452801.0, 0.0, ClockState(True, 0.01)))
+    assert finding.level is Level.FAIL
+    assert finding.text == "the clock says 2039-01-01, and Fast DDS works only until 2038-01-19"
+
+
+def test_static_peers_that_are_left_out() -> None:
+    assert levels(node_checks.static_peers(["planner-host"])) == [Level.WARN]
+    assert levels(node_checks.static_peers(())) == []
+
+
 def test_ros() -> None:
     assert levels(node_checks.ros(LOCALHOST, LOCALHOST, None)) == [Level.OK, Level.OK]
     assert levels(node_checks.ros({}, {}, None)) == [Level.OK, Level.WARN]
@@ -134,6 +146,29 @@ def test_ros() -> None:
     assert levels(node_checks.ros(unit, unit, None)) == [Level.OK, Level.OK]
     _, domain = node_checks.ros({**LOCALHOST, "ROS_DOMAIN_ID": "10"}, {}, None)
     assert "this shell: 0" in domain.text
+
+
+@pytest.mark.parametrize("reach", ["LOCALHOST", "SUBNET"])
+def test_users_that_shared_memory_keeps_apart(reach: str) -> None:
+    """The doctor said ok, and no call was ever answered."""
+    used = {"ROS_AUTOMATIC_DISCOVERY_RANGE": reach, "RMW_IMPLEMENTATION": "rmw_fastrtps_cpp"}
+    _, seen = node_checks.ros(used, used, None, of_unit=True, user=65534, others=frozenset({0, 65534}))
+    assert seen.level is Level.FAIL
+    assert "applications of root get no answer" in seen.text
+    assert "remove ROS_AUTOMATIC_DISCOVERY_RANGE from /etc/plr/sidecar.env" in seen.remedy
+    assert levels(node_checks.ros(used, used, None, user=65534)) == [Level.OK, Level.WARN]
+    assert levels(node_checks.ros(LOCALHOST, LOCALHOST, None, user=1000, others=frozenset({1000}))) == [Level.OK] * 2
+
+
+def test_a_range_that_finds_nobody_fails() -> None:
+    used = {"ROS_AUTOMATIC_DISCOVERY_RANGE": "OFF"}
+    assert levels(node_checks.ros(used, used, None)) == [Level.OK, Level.FAIL]
+
+
+def test_the_advice_under_a_unit_leads_to_its_profile_not_to_localhost() -> None:
+    used = {"ROS_AUTOMATIC_DISCOVERY_RANGE": "SUBNET", "FASTRTPS_DEFAULT_PROFILES_FILE": "/etc/plr/fastdds.xml"}
+    _, domain = node_checks.ros(used, used, None, of_unit=True, user=999)
+    assert (domain.level, "LOCALHOST" in domain.remedy) == (Level.WARN, False)
 
 
 def test_types() -> None:
@@ -164,6 +199,13 @@ def interface(name: str, **changes: object) -> Interface:
 )
 def test_interfaces(there: list[Interface], expected: list[Level]) -> None:
     assert levels(node_checks.interfaces(choose(there, ("wlan0", "wwan0")))) == expected
+
+
+def test_an_interface_that_the_sidecar_does_not_use_is_not_ok() -> None:
+    choice = choose([interface("wlan0"), interface("wwan0")], None)
+    assert levels(node_checks.interfaces(choice, {"wlan0", "wwan0"})) == [Level.OK, Level.OK]
+    assert levels(node_checks.interfaces(choice, {"wlan0"})) == [Level.OK, Level.WARN]
+    assert levels(node_checks.interfaces(choice, {"wlan0"}, {"wwan0": "taken"})) == [Level.OK]
 
 
 def test_the_reverse_path_filter(tmp_path: Path) -> None:
@@ -203,6 +245,27 @@ def test_the_environment_of_the_unit_is_not_read_where_others_may_write(tmp_path
     assert unit_environment(config).variables["PYTHONPATH"] == "/evil"
     file.write_bytes(b"ROS_DOMAIN_ID=1\0\0")
     assert "it contains a NUL byte" in unit_environment(config).refused
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="only a unit of root counts")
+def test_the_environment_of_the_unit_counts_while_the_sidecar_is_stopped(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The doctor judged this shell, and advised what breaks the unit."""
+    config, unit = tmp_path / "sidecar.yaml", tmp_path / "plr-sidecar.service"
+    config.touch()
+    shipped = Path("deploy/systemd/plr-sidecar.service").read_text().replace("/etc/plr/sidecar.yaml", str(config))
+    unit.write_text(shipped.replace("User=plr", "User=nobody"))
+    monkeypatch.setattr(host, "installed", lambda path: installed(path, [tmp_path]))
+    monkeypatch.setenv("ROS_DOMAIN_ID", "7")
+    monkeypatch.delenv("ROS_AUTOMATIC_DISCOVERY_RANGE", raising=False)
+    found = unit_environment(config)
+    assert (found.of_unit, found.user, "ROS_DOMAIN_ID" in found.variables) == (True, 65534, False)
+    assert levels(node_checks.ros(found.variables, {}, None, of_unit=True, user=65534)) == [Level.OK, Level.OK]
+    (tmp_path / "sidecar.env").write_text("ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST\n")
+    found = unit_environment(config)
+    assert levels(node_checks.ros(found.variables, {}, None, of_unit=True, user=65534)) == [Level.OK, Level.WARN]
+    assert not unit_environment(tmp_path / "other.yaml").of_unit
 
 
 @pytest.mark.skipif(os.geteuid() != 0, reason="giving a file away takes root")

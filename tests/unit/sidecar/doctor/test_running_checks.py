@@ -271,3 +271,8 @@ def test_the_control_stream() -> None:
     lost = {"names": ["cp:50051"], "connected": False, "since_s": 90.0, "last_failure": "nothing arrives over wlan0"}
     (text,) = texts(running_checks.control(state(control=lost)), Level.WARN)
     assert text.startswith("cp:50051 not reached for 90 s: nothing arrives over wlan0")
+
+
+def test_a_socket_that_could_not_be_opened_fails() -> None:
+    why = "its socket could not be opened: Address already in use (udp_port 24999)"
+    assert texts(running_checks.devices(state(unopened={"lo": why})), Level.FAIL) == [f"lo: {why}"]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import socket
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
@@ -191,3 +192,19 @@ def test_a_refused_socket_is_tried_again_soon(host: Host, monkeypatch: pytest.Mo
     assert host.manager._wait_s() <= RETRY_S
     host.look(LO)
     assert list(host.links) == [LO.name]
+
+
+@pytest.mark.audit("ops-14")
+def test_a_port_that_is_taken_is_no_lack_of_interfaces(host: Host, caplog: pytest.LogCaptureFixture) -> None:
+    with socket.socket(socket.AF_INET6, socket.SOCK_DGRAM) as taken:
+        taken.bind(("::", 0))
+        port = taken.getsockname()[1]
+        host.manager._config = host.manager._config.model_copy(update={"udp_port": port})
+        host.look(LO)
+        why = f"its socket could not be opened: Address already in use (udp_port {port})"
+        assert host.manager.unopened() == {"lo": why}
+        assert (host.manager.in_use(), list(host.down)) == ({"lo": False}, ["lo"])
+        (warning,) = [record.getMessage() for record in caplog.records if record.levelname == "WARNING"]
+        assert warning == f"no interface is in use, so no request can be carried (lo: {why})"
+    host.look(LO)
+    assert (host.manager.unopened(), host.manager.in_use()) == ({}, {"lo": True})
