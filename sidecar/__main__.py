@@ -28,6 +28,7 @@ with extras.required("plr-sidecar", "sidecar"):
     from plr.protos.program.logging_setup import Logging
     from plr.protos.program.tls_files import load_tls_files
     from plr.protos.program.version_option import ShowVersion
+    from plr.sidecar.config.service_user import unreadable
     from plr.sidecar.config.sidecar import SidecarConfig, config_schema, load_config, refuse_exposed
     from plr.sidecar.ros import environment, static_peers
     from plr.sidecar.stop_request import StopRequest
@@ -83,6 +84,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             _warn_of_missing_interfaces(config)
             _warn_of_short_deadlines(config)
             _check_certificate(config)
+            _warn_of_unreadable_files(options.config, config)
             _check_ros(thorough=True)
             _warn_of_unresolvable_peers()
             _warn_of_missing_types(config)
@@ -170,6 +172,12 @@ def _check_certificate(config: SidecarConfig) -> None:
     if not problem.in_force:
         raise ConfigError("", "", problem.text)
     sys.stderr.write(f"{PROGRAM}: warning: {problem.text}\n")
+
+
+def _warn_of_unreadable_files(path: Path, config: SidecarConfig) -> None:
+    found = unreadable(path, config.tls_dir)
+    if found is not None:
+        sys.stderr.write(f"{PROGRAM}: warning: {escaped(f'{found.text}; do: {found.remedy}')}\n")
 
 
 def _run(config: SidecarConfig) -> int:

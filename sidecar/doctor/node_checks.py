@@ -134,6 +134,8 @@ def ros(
             "correct the environment of the unit (/etc/plr/sidecar.env) or of this shell: docs/start/install.md, "
             "ROS on the host"
         )
+        if problem.endswith(SET_CLOCK):
+            problem, remedy = problem.removesuffix(f"; {SET_CLOCK}"), SET_CLOCK
         yield fail("ros", problem, remedy)
     else:
         yield ok(

@@ -18,6 +18,7 @@ from plr.sidecar.doctor import host, node_checks
 from plr.sidecar.doctor.finding import Finding, Level
 from plr.sidecar.doctor.host import ClockState, reverse_path_filter, unit_environment
 from plr.sidecar.net.interfaces import Interface, choose
+from plr.sidecar.ros.environment import clock_problem
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -129,6 +130,11 @@ def test_a_clock_that_ros_does_not_start_with() -> None:
     finding = one(node_checks.clock(2177452801.0, 0.0, ClockState(True, 0.01)))
     assert finding.level is Level.FAIL
     assert finding.text == "the clock says 2039-01-01, and Fast DDS works only until 2038-01-19"
+
+
+def test_a_clock_that_keeps_ros_from_starting_is_the_remedy() -> None:
+    broken, _ = node_checks.ros(LOCALHOST, LOCALHOST, clock_problem(2177452801.0))
+    assert (broken.level, broken.remedy) == (Level.FAIL, "set it: timedatectl set-ntp true, or date -s")
 
 
 def test_static_peers_that_are_left_out() -> None:
