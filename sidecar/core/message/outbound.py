@@ -79,6 +79,14 @@ class OutboundMessage:
         return self.symbols.over
 
     @property
+    def is_there(self) -> bool:
+        """Whether the peer has all of it, as far as is known, or none of it has to travel any more.
+
+        A faulty peer may acknowledge all symbols and not report the message FINISHED.
+        """
+        return self.symbols.over or self.symbols.arrived >= self.symbols.count
+
+    @property
     def newest(self) -> OutboundMessage:
         """The message that carries the bytes now: this one, or what it was cut into."""
         message = self

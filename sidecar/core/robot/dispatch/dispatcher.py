@@ -13,6 +13,7 @@ from plr.sidecar.core.base.values import PathState
 from plr.sidecar.core.robot.dispatch.adaptive import Adaptive
 from plr.sidecar.core.robot.dispatch.budgets import Budgets
 from plr.sidecar.core.robot.dispatch.exploration import Exploration
+from plr.sidecar.core.robot.dispatch.favourites import Favourites
 from plr.sidecar.core.robot.dispatch.modes import MODES
 from plr.sidecar.core.robot.dispatch.pair_history import PathPaces, PathRecords
 from plr.sidecar.core.robot.request.request import Copy, CopyState, Request
@@ -22,7 +23,7 @@ from plr.sidecar.core.wire.messages import RequestMessage, encode_message
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterable
 
-    from plr.protos.model.ids import NodeName, ServiceName
+    from plr.protos.model.ids import NodeName
     from plr.sidecar.core.base.values import PathId
     from plr.sidecar.core.robot.dispatch.context import RequestParts
 
@@ -57,8 +58,7 @@ class Dispatching:
         self._paces = PathPaces(parts.routes, parts.stats)
         self.adaptive = Adaptive(parts.routes, self._paces)
         self._budgets = Budgets(parts.budgets, parts.stats)
-        self._favourites: dict[ServiceName, NodeName] = {}
-        """The server to which shared requests of each service go."""
+        self._favourites = Favourites(parts.mapping, parts.routes)
 
     def with_room(self, servers: Iterable[NodeName], request: Request) -> list[NodeName]:
         """Return those of the servers to which the request may be sent now."""
@@ -129,31 +129,21 @@ class Dispatching:
         """
         if request.races or request.size <= SMALL_REQUEST_BYTES:
             return False
-        server = self._favourite(request.service, servers, chosen)
+        server = self._favourites.choose(request.service, servers, chosen)
         if server is None:
             return False
-        first, *others = self._parts.mapping.up_to(server, chosen)
-        size = request.size
-        others = [path for path in others if self._budgets.allows(path.interface, request.service, size, now)]
-        self._send(request, first, now, _Why.MAPPED, shared_by=tuple(others), repeats=request.rule.repeats)
+        self._send_shared(request, server, chosen, _Why.MAPPED, now)
         request.withheld = tuple(path for path in chosen if path.peer != server)
         return True
 
-    def _favourite(
-        self, service: ServiceName, servers: Collection[NodeName], chosen: Collection[PathId]
-    ) -> NodeName | None:
-        """Return the server that requests of the service went to last, while it may be asked and is reached.
-
-        Another one would begin with paths about which less is known, over the same networks.
-        """
-        favourite = self._favourites.get(service)
-        if favourite is not None and favourite in servers and self._parts.mapping.up_to(favourite, chosen):
-            return favourite
-        up = [path for path in chosen if self._parts.mapping.up_to(path.peer, chosen)]
-        if not up:
-            return None
-        self._favourites[service] = min(up, key=self._parts.routes.rtt).peer
-        return self._favourites[service]
+    def _send_shared(
+        self, request: Request, server: NodeName, paths: Collection[PathId], why: _Why, now: float
+    ) -> bool:
+        """Send one copy to a server over all interfaces of these paths, some of which reach it."""
+        first, *others = self._parts.mapping.up_to(server, paths)
+        size = request.size
+        others = [path for path in others if self._budgets.allows(path.interface, request.service, size, now)]
+        return self._send(request, first, now, why, shared_by=tuple(others), repeats=request.rule.repeats)
 
     def _best_first(self, request: Request, paths: Iterable[PathId], now: float) -> list[PathId]:
         """Sort paths: those that are up first, among them the best by the mode, then the fastest."""
@@ -185,9 +175,20 @@ class Dispatching:
         return self._send(request, path, now, _Why.HEDGE)
 
     def ask_another_server(self, request: Request, now: float) -> None:
-        """Ask another server, also over the same interface, if the only one asked has the request and is silent."""
-        if request.rule.idempotent and request.waits_for_one_server():
+        """Ask another server, also over the same interface, if the only one asked has the request and is silent.
+
+        Of a shared request it may also have too little by now.
+        """
+        if request.rule.idempotent and (request.waits_for_one_server() or self._falls_behind(request, now)):
             self.rescue(request, now, insist=True)
+
+    def _falls_behind(self, request: Request, now: float) -> bool:
+        """Return whether a shared request will be late if it goes on arriving as it did so far."""
+        if not MODES[request.rule.redundancy].shares:
+            return False
+        passed = (now - request.submitted_at) / request.rule.deadline_s
+        carried = [copy.message.newest.symbols for copy in request.relied_on()]
+        return all(symbols.arrived < passed * symbols.count for symbols in carried)
 
     def rescue(self, request: Request, now: float, *, insist: bool = False, rejected: bool = False) -> None:
         """Send one more copy when no copy that is relied on is on a path that is up (or when `insist`).
@@ -198,8 +199,12 @@ class Dispatching:
         waiting = request.relied_on()
         if request.is_answered or (waiting and not request.rule.redundancy.helps):
             return
-        if any(copy.shared_by and self._is_on_its_way(copy) for copy in waiting):
-            return  # over every interface already: another copy would take from it what it needs
+        if MODES[request.rule.redundancy].shares and len(request.asked()) == 1:
+            arriving = [copy for copy in waiting if self._is_on_its_way(copy)]
+            if arriving:  # over every interface already: another copy takes from it what it needs
+                if insist:
+                    self._try_another_server(request, arriving[0], now)
+                return
         if rejected and len(request.copies) >= MAX_COPIES_OF_REQUEST:
             return  # its retry keeps asking, at a slower pace
         alive = any(routes.best_state(copy.paths) is not PathState.DOWN for copy in waiting)
@@ -219,7 +224,16 @@ class Dispatching:
 
     def _is_on_its_way(self, copy: Copy) -> bool:
         """Return whether its server may not have all of it yet because its path is slow but not silent."""
-        return not copy.message.newest.over and self._parts.routes.best_state(copy.paths) is PathState.UP
+        return not copy.message.newest.is_there and self._parts.routes.best_state(copy.paths) is PathState.UP
+
+    def _try_another_server(self, request: Request, slow: Copy, now: float) -> None:
+        """Share a request with another server as well, if it is time to find out whether one is better."""
+        if not self._favourites.may_try(request.service, now):
+            return
+        servers = self.with_room(self._favoured(self.candidates(request), now), request)
+        server = self._favourites.other(request.service, slow.path.peer, servers, slow.paths)
+        if server is not None and self._send_shared(request, server, slow.paths, _Why.TROUBLE, now):
+            self._favourites.tried(request.service, now)
 
     def next_over_another_interface(self, request: Request, now: float) -> PathId | None:
         """Return the same, if none of the copies relied on uses its interface."""
@@ -282,16 +296,29 @@ class Dispatching:
         latency_s = min(now - copy.sent_at, request.rule.deadline_s)
         if not copy.shared_by:
             self._paces.answered(request.service, copy.path, latency_s, processing_s, now)
-        elsewhere = [other.path.peer for other in request.relied_on() if other.message.newest.over]
-        if not request.races and self._favourites.get(request.service) in elsewhere:
-            self._favourites[request.service] = copy.path.peer  # the other one has the request and does not answer
+        if MODES[request.rule.redundancy].shares and not request.races:
+            self._favourites.answered(request.service, copy, request.relied_on())
 
     def ended(self, request: Request, now: float) -> None:
         """Note the outcome of the copies, once for each request: all are known, or the deadline is over."""
         self.records.note(request, now)
+        if MODES[request.rule.redundancy].shares and not request.rule.idempotent:
+            self._leave_silent_server(request, now)
         if self._budgets.limit and any(copy.in_time for copy in request.copies):
             paths = (*request.withheld, *(copy.path for copy in request.copies))
             self._budgets.earn(request.copies[0].message.symbols.total, {path.interface for path in paths})
+
+    def _leave_silent_server(self, request: Request, now: float) -> None:
+        """Let the next requests go to another server after a missed one, which itself must not run twice."""
+        service = request.service
+        for copy in request.relied_on():
+            up = self._parts.routes.best_state(copy.paths) is PathState.UP
+            if up and self._favourites.may_leave(service, copy.path.peer, now):
+                servers = self._favoured(self._parts.offers.servers(service), now)
+                other = self._favourites.other(service, copy.path.peer, servers, copy.paths)
+                if other is not None:
+                    self._favourites.tried(service, now)
+                    self._favourites.move(service, other)
 
     def _send(
         self,

@@ -169,7 +169,7 @@ class Request:
 
     def waits_for_one_server(self) -> bool:
         """Return whether a single server was asked, holds the request, and has not answered."""
-        return len(self.asked()) == 1 and any(copy.message.newest.over for copy in self.relied_on())
+        return len(self.asked()) == 1 and any(copy.message.newest.is_there for copy in self.relied_on())
 
     def certainly_not_run(self) -> bool:
         """Return whether no server has run it or will run it."""
