@@ -124,16 +124,18 @@ class SendQueue:
         heapq.heappush(mine.fresh, (message.deadline, next(self._order), entry))
 
     def _purge(self) -> None:
-        """Drop messages that are over but have not come up yet, so that they hold no memory."""
+        """Drop messages that are over but have not come up yet, so that they hold no memory.
+
+        The engine's thread ends messages meanwhile: each is judged once, so that no list keeps what another one drops.
+        """
+        over = {number for number, entry in self._entries.items() if entry.message.over}
         for each in self._classes:
-            for heap in each.heaps:
-                heap[:] = [item for item in heap if not item[2].message.over]
+            for heap in (*each.heaps, each.newest):
+                heap[:] = [item for item in heap if item[2].message.number not in over]
                 heapq.heapify(heap)
-            each.newest[:] = [item for item in each.newest if not item[2].message.over]
-            heapq.heapify(each.newest)
-        for number in [number for number, entry in self._entries.items() if entry.message.over]:
+        for number in over:
             del self._entries[number]
-        self._spare_time.purge()
+        self._spare_time.purge(over)
         self._purge_at = max(PURGE_AT, 2 * len(self._entries))
 
     def take(
@@ -184,7 +186,7 @@ class SendQueue:
             self._note_turn(waiting, chosen, run.symbols)
             return run
         run = spare_time.take(now, budget, round_trip_s) if may_repeat else None
-        if run is None and spare_time.members:
+        if run is None and self._entries:
             self.rests_until = min(spare_time.next_look, now + LOOK_AT_LEAST_EVERY_S)
         return run
 
@@ -194,7 +196,10 @@ class SendQueue:
             if each is chosen:
                 each.passed_over = max(0, each.passed_over - SHARE * symbols) if each is not waiting[0] else 0
                 higher = False
-            elif not higher:
+                continue
+            if each.fresh:
+                each.fresh[0][2].waits()  # the other paths must not rely on this one for it
+            if not higher:
                 each.passed_over = min(each.passed_over + symbols, SHARE * MAX_RUN)
 
     def _take(

@@ -14,7 +14,7 @@ from plr.sidecar.core.base.timers import NEVER
 from plr.sidecar.core.path.turn import LOOK_AGAIN_S, SharedTurn, SymbolRun, most_symbols
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Collection, Iterator
 
     from plr.sidecar.core.path.turn import Turn
 
@@ -138,9 +138,9 @@ class SpareTime:
         self.remove(entry.message.number)
         self._entries.pop(entry.message.number, None)
 
-    def purge(self) -> None:
-        """Forget messages that are over, and what was removed."""
-        self.members = {number: entry for number, entry in self.members.items() if not entry.message.over}
+    def purge(self, over: Collection[int]) -> None:
+        """Forget messages with these numbers, which are over, and what was removed."""
+        self.members = {number: entry for number, entry in self.members.items() if number not in over}
         for item in self._repeatable:
             item[-1].listed = self._is_member(item[-1])
         for *_, entry in self._declined:

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+import pytest
 
+from plr.sidecar.core.base.values import Priority
 from plr.sidecar.core.message.sharing import OFFER_S
-from plr.sidecar.core.path.send_queue import LOOK_AT_LEAST_EVERY_S, SendQueue
+from plr.sidecar.core.message.symbols import MessageSymbols
+from plr.sidecar.core.path.send_queue import LOOK_AT_LEAST_EVERY_S, PURGE_AT, SendQueue
 from plr.sidecar.core.path.turn import LOOK_AGAIN_S
+from plr.sidecar.core.wire.messages import Encoded
 from tests.support.builders import message
-
-if TYPE_CHECKING:
-    from plr.sidecar.core.message.symbols import MessageSymbols
 
 ONE = 1
 """A budget for one symbol."""
@@ -213,3 +213,56 @@ def test_messages_that_are_over_stay_in_memory_for_a_moment_only() -> None:
         each.over = True
     assert take(second, now=LOOK_AGAIN_S, repeats=False) == (9, 0, 1)
     assert len(second) == 1, "although the other one goes on"
+
+
+def test_a_path_busy_with_a_higher_priority_offers_nothing_for_a_lower_one() -> None:
+    low = message(1, 12_000, deadline=5.0, repeats=0.0, priority=Priority.LOW)
+    first, second = both(low)
+    first.add(message(2, 120_000, deadline=5.0, priority=Priority.HIGH))
+    for _ in range(3):
+        assert take(first) in {(2, 0, 1), (2, 1, 1), (2, 2, 1)}
+    slow_pace, slow_rtt_s = PACE / 100, 10 * RTT_S
+    assert take(second, pace=slow_pace, rtt_s=slow_rtt_s) == (1, 0, 1)
+
+
+def test_its_offer_stands_while_nothing_else_waits() -> None:
+    first, second = both(message(1, 12_000, deadline=5.0, repeats=0.0, priority=Priority.LOW))
+    assert take(first) == (1, 0, 1)
+    assert take(second, pace=PACE / 100, rtt_s=10 * RTT_S) is None
+
+
+class EndsWhileLookedAt(MessageSymbols):
+    """A message that the engine ends between two looks of the link's thread."""
+
+    looks = 1_000_000
+
+    @property
+    def over(self) -> bool:
+        """Whether it has been looked at too often."""
+        self.looks -= 1
+        return self.looks < 0
+
+    @over.setter
+    def over(self, _to: bool) -> None: ...
+
+
+@pytest.mark.parametrize("looks", range(6))
+@pytest.mark.parametrize("repeats", [None, 1.0])
+def test_a_message_that_ends_during_a_purge_stays_whole_or_goes(looks: int, repeats: float | None) -> None:
+    queue = SendQueue()
+    ending = EndsWhileLookedAt(0, Encoded(b"", bytes(12_000)), deadline=5.0, expires=9.0, repeats=repeats)
+    queue.add(ending)
+    ending.looks = looks
+    for number in range(1, PURGE_AT + 1):
+        queue.add(message(number, 12_000, deadline=5.0))
+    while take(queue, MUCH) is not None:
+        pass
+    assert len(queue) == 0
+
+
+def test_a_queue_that_gives_nothing_rests() -> None:
+    queue = SendQueue()
+    queue.add(shared())
+    assert queue.take(1.0, MUCH, PACE, RTT_S, pulls=False, repeats=False) is None
+    assert len(queue) == 1
+    assert queue.rests_until > 1.0

@@ -98,7 +98,7 @@ def test_purging_forgets_what_is_over() -> None:
     over, alive = turn(1), turn(2)
     line, _ = spare_time(over, alive)
     over.message.over = True
-    line.purge()
+    line.purge({over.message.number})
     assert [entry for *_, entry in line._repeatable] == [alive]
     line.clear()
     assert numbers(line) == []
