@@ -151,7 +151,7 @@ def _warn_of_unresolvable_peers() -> None:
 def _warn_of_missing_types(config: SidecarConfig) -> None:
     if config.role is not Role.ROBOT:
         return  # the type of a local server is only known when it runs
-    from plr.sidecar.ros.graph.known_types import missing_types
+    from plr.sidecar.ros.graph.missing_types import missing_types
     from plr.sidecar.state.store import peek_last_good
 
     peers = peek_last_good(config.state_dir, config.node_name).peers

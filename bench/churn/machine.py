@@ -6,7 +6,7 @@ import os
 from dataclasses import dataclass
 from pathlib import Path
 
-from bench.pressure import CpuPressure
+from lab.pressure import CpuPressure
 
 _STAT = Path("/proc/stat")
 _IDLE = slice(3, 5)

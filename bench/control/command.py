@@ -19,9 +19,9 @@ from bench.control.crowd import Crowd
 from bench.control.member import INTERFACES, SERVICE, Member
 from bench.control.plane import Plane
 from bench.control.targets import SIZES, targets
-from bench.pressure import CpuPressure
 from bench.reporting.machine import machine
 from bench.reporting.terminal import show_verdicts
+from lab.pressure import CpuPressure
 from plr.controlplane.ca import Authority
 from plr.protos.model.ids import NodeName, Role
 from plr.protos.trust.identity import IdentityRole

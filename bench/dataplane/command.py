@@ -16,9 +16,9 @@ from bench.dataplane.report import Report
 from bench.dataplane.section import Context, Findings
 from bench.dataplane.sections import SECTIONS
 from bench.dataplane.targets import TARGETS
-from bench.pressure import CpuPressure
 from bench.reporting.machine import machine
 from bench.reporting.terminal import rich_table, show_verdicts
+from lab.pressure import CpuPressure
 
 if TYPE_CHECKING:
     import argparse

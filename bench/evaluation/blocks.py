@@ -5,9 +5,9 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 from bench.evaluation import repeats
+from bench.evaluation.alternatives import BETTER_DIRECT, OTHERS
 from bench.evaluation.comparison import DIRECT, IDEAL, SUREST
 from bench.evaluation.ideal import ORACLE
-from bench.evaluation.others import BETTER_DIRECT, OTHERS
 from bench.evaluation.outcome import UNANSWERED_S
 from bench.evaluation.repeats import Repeat, Repeats
 from bench.evaluation.studies import CASES

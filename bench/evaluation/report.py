@@ -6,7 +6,7 @@ from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any
 
 from bench.dataplane.statistics import median
-from bench.evaluation import charts, findings, others, paper, repeats
+from bench.evaluation import alternatives, charts, findings, paper, repeats
 from bench.evaluation.comparison import DIRECT, IDEAL, SUREST, better_direct, compare, gains, over_direct
 from bench.evaluation.ideal import COMPUTED, ORACLE
 from bench.evaluation.measured import Measured
@@ -113,7 +113,7 @@ def as_json(
         "studies": {study.name: _pooled_as_json(study) for study in found},
         "gains": {name: asdict(gain) for name, gain in gains(windows).items()},
         "redundancy_modes": {name: asdict(cost) for name, cost in mode_costs(windows).items()},
-        "others": {name: asdict(one) for name, one in others.beside(outcomes).items()},
+        "others": {name: asdict(one) for name, one in alternatives.beside(outcomes).items()},
         "drives": None if drives is None else asdict(drives),
         "everywhere": _everywhere_as_json(outcomes, drives),
         "reproduced": _repeats_as_json(outcomes, again),
@@ -216,10 +216,10 @@ def _pooled_as_json(study: Study) -> dict[str, Any]:
     shared = pool(study.windows)
     if shared is None:
         return {"windows": []}
-    pools = {name: others.pooled(runs) for name, runs in shared.runs.items()}
+    pools = {name: alternatives.pooled(runs) for name, runs in shared.runs.items()}
     if shared.runs.keys() >= {*DIRECT}:
         better = [better_direct(study.windows[window]) for window in shared.windows]
-        pools = {others.BETTER_DIRECT: others.pooled(better), **pools}
+        pools = {alternatives.BETTER_DIRECT: alternatives.pooled(better), **pools}
     contenders = {name: {**asdict(one.figures), "median_p99_ms": one.median_p99_ms} for name, one in pools.items()}
     return {"windows": list(shared.windows), "contenders": contenders}
 
@@ -228,8 +228,11 @@ def _everywhere_as_json(outcomes: Sequence[Outcome], drives: Drives | None) -> l
     """Return the results in all drives, then in those in which every mode ran."""
     found: list[dict[str, Any]] = []
     windows = figures_by_window(outcomes)
-    for names in ((*others.OTHERS, SUREST, IDEAL, ORACLE), (*others.OTHERS, *others.PLR, IDEAL, ORACLE)):
-        one = others.everywhere(outcomes, names)
+    for names in (
+        (*alternatives.OTHERS, SUREST, IDEAL, ORACLE),
+        (*alternatives.OTHERS, *alternatives.PLR, IDEAL, ORACLE),
+    ):
+        one = alternatives.everywhere(outcomes, names)
         if one is None:
             continue
         if found and len(one.windows) == len(found[0]["windows"]):
@@ -261,7 +264,7 @@ def _alike(windows: Windows, contender: str, drives: Drives | None) -> float | N
 
 
 def _miss_ratio(by_name: Mapping[str, Figures], contender: str) -> float:
-    if contender == others.BETTER_DIRECT:
+    if contender == alternatives.BETTER_DIRECT:
         return min(by_name[direct].miss_ratio for direct in DIRECT)
     return by_name[contender].miss_ratio
 

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any
 from bench.dataplane.statistics import MS, Calls, quantile
 from bench.evaluation.contenders import PATHS, WARM, World
 from bench.evaluation.outcome import UNANSWERED_S, Outcome, Request
-from bench.pressure import BUSY_SHARE, CpuPressure
 from lab import Lab
+from lab.pressure import BUSY_SHARE, CpuPressure
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence

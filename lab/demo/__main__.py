@@ -23,10 +23,10 @@ from typing import TYPE_CHECKING
 
 from rich.console import Console
 
-from bench.pressure import BUSY_SHARE, CpuPressure
 from lab import Lab, LabConfig, LabError
 from lab.demo import report
 from lab.demo.story import PHASES, WLAN, WWAN, Stage
+from lab.pressure import BUSY_SHARE, CpuPressure
 from lab.system import Part, System, SystemFailureError, read_json
 
 if TYPE_CHECKING:

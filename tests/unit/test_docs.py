@@ -249,16 +249,32 @@ def test_every_page_is_linked_from_the_readme() -> None:
 
 
 def test_architecture_names_files_that_exist() -> None:
-    named = re.findall(r"`((?:sidecar|controlplane|protos|lab|bench|tests|deploy)/[\w./]+)`", read("architecture.md"))
+    named = re.findall(
+        r"`((?:sidecar|controlplane|protos|lab|bench|tests|deploy|examples)/[\w./-]+)`", read("architecture.md")
+    )
     assert len(named) > 20
     assert [name for name in named if not (ROOT / name).exists()] == []
-    bare = set(re.findall(r"[`>\s]([a-z_]+\.py)\b", read("architecture.md")))
+    bare = set(re.findall(r"[`>\s]([a-z_-]+\.(?:py|yml))\b", read("architecture.md")))
     known = {
         path.name
-        for folder in ("sidecar", "controlplane", "protos", "lab", "bench", "tests")
-        for path in (ROOT / folder).rglob("*.py")
+        for folder in ("sidecar", "controlplane", "protos", "lab", "bench", "tests", "deploy")
+        for path in (ROOT / folder).rglob("*.*")
     }
     assert bare - known == set()
+
+
+def test_architecture_names_every_thread_and_every_lock_of_the_programs() -> None:
+    found = section(read("architecture.md"), "Threads, loops and locks")
+    locks = found.split("### Locks", 1)[1]
+    missing = []
+    for path in (path for package in ("sidecar", "controlplane", "protos") for path in (ROOT / package).rglob("*.py")):
+        text, name = path.read_text(encoding="utf-8"), str(path.relative_to(ROOT))
+        if re.search(r"threading\.Thread\(|ThreadPoolExecutor\(|asyncio\.to_thread\(", text) and name not in found:
+            missing.append(f"thread of {name}")
+        missing += [f"thread {one}" for one in re.findall(r"name=\"(plr-[\w-]+)\"", text) if f"`{one}`" not in found]
+        if re.search(r"(threading|asyncio)\.(R?Lock|Condition|(Bounded)?Semaphore)\(", text) and name not in locks:
+            missing.append(f"lock of {name}")
+    assert missing == []
 
 
 def test_sources_name_pages_that_exist() -> None:

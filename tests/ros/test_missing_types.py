@@ -10,7 +10,7 @@ from plr.protos.model.ids import NodeName, Role, ServiceName, SessionId, Version
 from plr.protos.model.members import Peer, PeerSet, ServiceOffer
 from plr.sidecar.__main__ import main
 from plr.sidecar.core.rules.service_rule import ServiceRule
-from plr.sidecar.ros.graph.known_types import MAX_MISSING_TYPE_LINES, missing_types
+from plr.sidecar.ros.graph.missing_types import MAX_MISSING_TYPE_LINES, missing_types
 from plr.sidecar.state.file import LastGood, encode_last_good
 from plr.sidecar.state.store import LAST_GOOD_FILE
 
