@@ -29,7 +29,7 @@ LIKE = {
     "zenoh": "`zenoh` over both, first reply",
     "zenoh-drop": "`zenoh-drop`: the same, dropping what finds its queue full",
     "oracle": "`oracle`: knows the trace, splits each request between both paths",
-    "ideal": "`ideal` (computed, not a bound): requests go over two first-in-first-out paths, the faster one counts",
+    "ideal": "`ideal` (computed, not a bound): each request goes over two FIFO queues, the faster answer counts",
 }
 _NOTHING: Content = {}
 
@@ -263,8 +263,8 @@ def _budgets(content: Content) -> str:
     if share is None:
         return NOTHING
     return (
-        f"Largest share of extra copies with `extra_load: 0.1`: {_percent(share)} "
-        f"({content['from']['budget_extra_share']})."
+        f"With `extra_load: 0.1`, the extra copies over one interface had at most {_percent(share)} of the bytes of "
+        f"the requests that were answered in time ({content['from']['budget_extra_share']})."
     )
 
 

@@ -112,7 +112,10 @@ def distributions(name: str, pool: Pool) -> Chart:
     deadline_ms = pool.runs[rows[0]][0].deadline_ms
     axes.axvline(deadline_ms, color="#c8202f", linewidth=0.8, linestyle=":")
     axes.grid(axis="x", alpha=0.25)
-    about = "How latencies are distributed (heights are roots of shares); dashed: P99, dot: mean, dotted: the deadline"
+    about = (
+        "Distribution of the latencies. The height is the square root of the share of requests. Dashed line: P99. "
+        "Dot: mean. Dotted line: deadline"
+    )
     return Chart(name, about, svg_of(canvas))
 
 
@@ -161,7 +164,7 @@ def deadlines(name: str, pool: Pool) -> Chart:
     axes.yaxis.set_major_formatter(FuncFormatter(lambda share, _place: f"{share * 100:g} %"))
     axes.grid(alpha=0.25)
     canvas.legend(loc="outside right upper", fontsize=8, frameon=False)
-    about = "Share of requests that miss, against the deadline; a line ends where nothing misses"
+    about = "Share of requests that miss, against the deadline. A line ends where no request misses"
     return Chart(name, about, svg_of(canvas))
 
 

@@ -63,12 +63,14 @@ def _drives(found: Evidence, outcomes: Sequence[Outcome]) -> None:
     complete = {name: runs for name, runs in windows.items() if runs.keys() >= {*DIRECT, SUREST, IDEAL}}
     recorded = len({one.scenario for one in outcomes})
     if recorded:
-        found.add("drive_windows", len(complete), f"{recorded} there are; the others are incomplete or void")
+        found.add(
+            "drive_windows", len(complete), f"of {recorded} windows; a window that is incomplete or void does not count"
+        )
     gain = gains(complete).get(SUREST)
     if gain is not None:
-        counted = f"{gain.windows} drives on which a direct run misses anything"
+        counted = f"median of the {gain.windows} windows in which a direct run misses a request"
         everywhere = (median(over_direct(complete.values(), SUREST, figure)) for figure in ("mean_ms", "p99_ms"))
-        notes = (f"{counted}; of all {len(complete)}: {value:.3g}" for value in everywhere)
+        notes = (f"{counted}; median of all {len(complete)}: {value:.3g}" for value in everywhere)
         found.add("mean_gain", gain.median_mean_gain, next(notes))
         found.add("p99_gain", gain.median_p99_gain, next(notes))
     excess = {name: r[SUREST].miss_ratio - (1.1 * r[IDEAL].miss_ratio + 0.005) for name, r in complete.items()}
@@ -76,14 +78,14 @@ def _drives(found: Evidence, outcomes: Sequence[Outcome]) -> None:
         worst = max(excess, key=lambda name: excess[name])
         ours, ideal = complete[worst][SUREST].miss_ratio, complete[worst][IDEAL].miss_ratio
         above = sum(value > 0 for value in excess.values())
-        note = f"above 0 in {above} of {len(excess)}; worst {worst}: {ours:.1%}, ideal {ideal:.1%}"
+        note = f"above 0 in {above} of {len(excess)} windows; worst {worst}: {SUREST} {ours:.1%}, ideal {ideal:.1%}"
         found.add("miss_excess", excess[worst], note)
     good = {name: r for name, r in complete.items() if not any(r[direct].miss_ratio for direct in DIRECT)}
     above_ms = {name: r[SUREST].p99_ms - (1.05 * r[IDEAL].p99_ms + 10) for name, r in good.items()}
     if above_ms:
         worst = max(above_ms, key=lambda name: above_ms[name])
         ours, ideal = good[worst][SUREST].p99_ms, good[worst][IDEAL].p99_ms
-        note = f"{len(good)} such drives; worst {worst}: {ours:.0f} ms, ideal {ideal:.0f} ms"
+        note = f"{len(good)} such windows; worst {worst}: {SUREST} {ours:.0f} ms, ideal {ideal:.0f} ms"
         found.add("good_p99_excess_ms", above_ms[worst], note)
 
 
@@ -119,7 +121,9 @@ def _budgets(found: Evidence, outcomes: Sequence[Outcome]) -> None:
     if shares:
         worst = max(shares, key=lambda key: shares[key])
         runs = len({key[:2] for key in shares})
-        found.add("budget_extra_share", shares[worst], f"{runs} runs; worst {', '.join(worst)}")
+        contender, scenario, interface = worst
+        note = f"{runs} runs; worst: {contender} in {scenario}, interface {interface}"
+        found.add("budget_extra_share", shares[worst], note)
 
 
 def _fallback(found: Evidence, outcomes: Sequence[Outcome]) -> None:
@@ -131,7 +135,8 @@ def _fallback(found: Evidence, outcomes: Sequence[Outcome]) -> None:
     missed = [counters.missed_by_network(run) for run in runs]
     known = [count for count in missed if count is not None]
     missed_text = str(sum(known)) if len(known) == len(runs) else "unknown"
-    note = f"of {requests} in {len(runs)} windows; missed by the network, with those of the warm-up: {missed_text}"
+    note = f"of {requests} requests in {len(runs)} windows"
+    note += f"; the network did not answer {missed_text} in time, including the warm-up"
     found.add("fallback_late", late, note)
     if len(known) == len(runs):
         found.figures["fallback_network_missed"] = sum(known)
@@ -143,7 +148,7 @@ def _one_operator(found: Evidence, outcomes: Sequence[Outcome]) -> None:
     if ours:
         named = [run for run in ours if _explains(run, Correlation.TOGETHER, Correlation.LIKELY)]
         sure = sum(_explains(run, Correlation.TOGETHER) for run in named)
-        note = f"{len(named)} of {len(ours)} windows, {sure} for sure"
+        note = f"{len(named)} of {len(ours)} windows; it is sure in {sure} of them"
         found.add("one_operator_explained", len(named) / len(ours), note)
     beside = [
         (runs[ONE_RADIO].figures(), runs[SUREST].figures())
@@ -156,7 +161,7 @@ def _one_operator(found: Evidence, outcomes: Sequence[Outcome]) -> None:
         found.add(
             "one_operator_mean_gain",
             one_radio_gain(figures_by_window(outcomes)),
-            f"median of {len(beside)} windows; missed {missed:.1%}, with one radio {alone:.1%}",
+            f"median of {len(beside)} windows; missed with both radios {missed:.1%}, with one {alone:.1%}",
         )
         found.figures["one_operator_missed"] = missed
         found.figures["one_radio_missed"] = alone
@@ -166,8 +171,9 @@ def _reproduced(found: Evidence, both: Repeats) -> None:
     if both.largest is not None:
         worst = both.ratios[both.largest]
         above = sum(one.difference > repeats.ALIKE for one in both.ratios.values())
-        note = f"above {repeats.ALIKE} in {above} of {len(both.ratios)}, {both.runs} runs in {both.windows} windows"
-        note += f"; largest {both.largest}: {worst.first:.3g}, {worst.second:.3g}"
+        note = f"above {repeats.ALIKE} for {above} of {len(both.ratios)} ratios"
+        note += f", from {both.runs} runs in {both.windows} windows"
+        note += f"; largest for `{both.largest}`: {worst.first:.3g} and {worst.second:.3g}"
         found.add("reproduced_difference", worst.difference, note)
 
 

@@ -123,5 +123,8 @@ def table(found: Sequence[OurRatio]) -> Table:
         for one in found
     )
     return Table(
-        "how many times lower than over a single path; no answer counts as 10 s, so no P99 is above that", columns, rows
+        "How many times lower the latency is than over a single path. A request without an answer counts as 10 s, so "
+        "no P99 is above 10 s.",
+        columns,
+        rows,
     )

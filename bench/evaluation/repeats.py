@@ -115,5 +115,5 @@ def table(repeats: Repeats) -> Table:
     """Return a table with the largest differences first."""
     ordered = sorted(repeats.ratios.items(), key=lambda item: -item[1].difference)
     rows = tuple((name, one.first, one.second, f"{one.difference * 100:.0f} %") for name, one in ordered)
-    title = f"The {repeats.runs} runs in {repeats.windows} windows that both evaluations have:"
+    title = f"Both evaluations have {repeats.runs} runs in {repeats.windows} windows:"
     return Table(title, ("ratio", "first", "second", "difference"), rows)

@@ -30,7 +30,14 @@ RUNS = "evaluation"
 """Folder of the records, within the folder of the reports."""
 _GAINS = ("mean", "p99")
 _COLUMNS = ("", "missed", "never answered", "mean ms", "P50 ms", "P99 ms", "kB/request")
-_MODE_COLUMNS = ("", "windows", "missed", "kB/request", "of replicate's avoided misses", "extra bytes over single")
+_MODE_COLUMNS = (
+    "",
+    "windows",
+    "missed",
+    "kB/request",
+    "avoided misses (plr-replicate = 100 %)",
+    "bytes beyond plr-single",
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -149,7 +156,7 @@ def modes_table(costs: Mapping[str, ModeCost]) -> Table:
         )
         for name, cost in costs.items()
     )
-    title = "redundancy modes, over the windows where direct-a, direct-b, plr-single and plr-replicate ran"
+    title = "All windows in which direct-a, direct-b, plr-single and plr-replicate ran:"
     return Table(title, _MODE_COLUMNS, rows)
 
 
@@ -159,7 +166,9 @@ def _repeats(outcomes: Sequence[Outcome], again: Measured | None) -> list[Sectio
     return [
         Section(
             "Repeated",
-            "Two evaluations of the same windows.",
+            "A second evaluation ran the same windows. A gain is the mean or P99 of the better direct run, divided by "
+            "that of the contender. The table shows the geometric mean or the median of the gains in the windows in "
+            "which a direct run misses a request. Gains over the worse use the worse direct run instead.",
             (),
             (repeats.table(repeats.compare(Measured.of(outcomes), again)),),
         )
@@ -171,7 +180,7 @@ def _modes(outcomes: Sequence[Outcome]) -> list[Section]:
     shared = pool(by_window(outcomes), (*DIRECT, *MODES), NEEDED)
     beside = mode_costs(figures_by_window(run for runs in shared.runs.values() for run in runs)) if shared else {}
     drawn = (charts.modes("modes", beside),) if beside else ()
-    about = "What further copies avoid and what they cost."
+    about = "How many misses further copies avoid, and how many bytes they cost."
     return [Section("Redundancy modes", about, drawn, (modes_table(costs),))] if costs else []
 
 
@@ -190,12 +199,13 @@ def _study(study: Study, outcomes: Sequence[Outcome]) -> Section:
             charts.bars(f"{study.name}-bars", figures),
             charts.deadlines(f"{study.name}-deadlines", shared),
         ]
-        about = f"Pooled over the {len(shared.windows)} of {len(study.windows)} windows in which all of these ran."
+        about = f"The table and the charts cover {len(shared.windows)} of {len(study.windows)} windows: those in which "
+        about += "every contender in the table ran."
         if shared.left_out:
             left_out = ", ".join(f"{name} ({count})" for name, count in shared.left_out.items())
-            about += f" Left out, as they ran in fewer of them: {left_out}."
+            about += f" Other contenders ran in fewer of these windows, and are left out: {left_out}."
         rows = tuple(_row(name, figures[name]) for name in ranked(figures))
-        tables = (Table("all these windows together", _COLUMNS, rows),)
+        tables = (Table("All requests of these windows together:", _COLUMNS, rows),)
     details = tuple(window_table(window, outcomes) for window in study.windows)
     return Section(study.title, about, tuple(drawn), tables, details)
 
