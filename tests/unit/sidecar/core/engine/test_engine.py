@@ -333,7 +333,13 @@ def test_a_cloud_that_drains_waits_only_for_what_is_awaited() -> None:
     assert sidecar.engine.busy == 0
 
 
-def test_a_peer_kept_only_for_its_paths_goes_with_the_last_of_them() -> None:
+def dormant(sidecar: Sidecar) -> list[NodeName]:
+    """The dormant peers that links were just told of."""
+    told = [command for command in sidecar.take()[0] if isinstance(command, SetPeers)]
+    return [peer.name for peer in told[-1].peers if peer.dormant] if told else []
+
+
+def test_a_peer_kept_only_for_its_paths_is_dormant_after_the_last_of_them() -> None:
     for goes in (PathChanged(path(), PathState.DOWN, ""), PeerClosed(A, SessionId(1))):
         sidecar = robot()
         sidecar.view(version=2)
@@ -341,7 +347,48 @@ def test_a_peer_kept_only_for_its_paths_goes_with_the_last_of_them() -> None:
         sidecar.take()
         sidecar.engine.on_link_event(goes, 0.2)
         assert A not in sidecar.engine.peers
-        assert SetPeers(()) in sidecar.take()[0]
+        assert not dormant(sidecar), "one that comes and goes costs links no work each time"
+        sidecar.engine.handle_timer(0.2 + SWEEP_EVERY_S)
+        assert dormant(sidecar) == [A]
+
+
+def silent_cloud() -> Sidecar:
+    """A cloud whose robot asked something, left the view, and fell silent."""
+    sidecar = cloud()
+    sidecar.receive(request(1))
+    sidecar.view(version=2)
+    sidecar.change(PathState.DOWN, 0.2)
+    assert ROBOT not in sidecar.engine.peers
+    sidecar.take()
+    return sidecar
+
+
+def test_a_dormant_peer_is_a_peer_again_when_a_path_to_it_lives() -> None:
+    sidecar = silent_cloud()
+    sidecar.receive(request(2))
+    assert sidecar.engine.stats.dropped["fragment_of_old_session"] == 1
+    sidecar.engine.on_link_event(PathChanged(path(WWAN, ROBOT), PathState.UP, ""), 1.0)
+    assert ROBOT not in sidecar.engine.peers, "we have no such interface"
+    sidecar.change(PathState.UP, 1.0)
+    assert ROBOT in sidecar.engine.peers
+    assert not sidecar.engine.cloud._away
+    sidecar.receive(request(3))
+    assert [type(event) for event in sidecar.take()[1]] == [ExecuteRequest]
+    sidecar.engine.handle_timer(9.0)
+    (told,) = (command for command in sidecar.take()[0] if isinstance(command, SetPeers))
+    assert not told.peers[0].dormant
+
+
+def test_a_dormant_robot_may_come_back_in_a_later_session() -> None:
+    sidecar = silent_cloud()
+    credential = credential_of(ROBOT, Role.CLOUD, 2, 2)
+    sidecar.engine.on_link_event(PeerRestarted(ROBOT, credential, at_home=True), 1.0)
+    assert ROBOT not in sidecar.engine.peers
+    commands, events = sidecar.take()
+    assert [type(event) for event in events] == [CancelExecution]
+    assert [one.session for command in commands if isinstance(command, SetPeers) for one in command.peers] == [2]
+    sidecar.change(PathState.UP, 2.0)
+    assert sidecar.engine.peers.session(ROBOT) == 2
 
 
 def test_a_flood_of_restarts_makes_little_work() -> None:
