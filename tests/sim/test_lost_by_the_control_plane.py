@@ -78,7 +78,7 @@ def test_a_tunnel_does_not_part_it_from_its_peers_for_good(who: str, dark_s: flo
     trial.planes.run(SOON_S)
     assert trial.is_answered()
     assert other.engine.peers.is_unlisted(lost.name)
-    assert [(name, removal.reason) for name, removal in other.engine.removals.latest(9)] == [
+    assert [(name, removal.reason) for name, removal in other.engine.removals.latest()] == [
         (lost.name, RemovalReason.LEASE_EXPIRED)
     ]
 
@@ -152,7 +152,7 @@ def test_a_listed_server_that_was_dormant_is_asked_at_once() -> None:
     trial.planes.run(SOON_S)
     assert not trial.robot.engine.peers.is_dormant(trial.cloud.name)
     assert trial.is_answered()
-    assert trial.robot.engine.removals.latest(9) == []
+    assert trial.robot.engine.removals.latest() == []
 
 
 def test_a_new_policy_ends_what_is_dormant() -> None:

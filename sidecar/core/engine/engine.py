@@ -7,7 +7,7 @@ application). Nothing here builds, seals or parses a datagram. What only one of 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 from plr.protos.base.errors import DecodeError, UnknownKindError
 from plr.protos.model.ids import Role
@@ -55,6 +55,7 @@ if TYPE_CHECKING:
     from plr.protos.model.members import Peer, PeerSet, RemovedPeer, ServiceOffer, ServiceUse
     from plr.protos.model.report import Report
     from plr.sidecar.core.crypto.session import OwnSession
+    from plr.sidecar.core.engine.removals import Removal
     from plr.sidecar.core.engine.role import EngineRole
     from plr.sidecar.core.message.decoding import Decoding
     from plr.sidecar.core.rules.budget import Budget
@@ -72,6 +73,15 @@ class EngineConfig:
     rules: tuple[ServiceRule, ...]
     budgets: tuple[Budget, ...] = ()
     """Robot: budgets, of which the first that matches an interface's name decides."""
+
+
+class RemovedPeerView(NamedTuple):
+    """A peer that the control plane removed, for people."""
+
+    name: NodeName
+    removal: Removal
+    kept: str | None
+    """`path`: it is a peer still, as a path to it lives; `dormant`; None: it is forgotten."""
 
 
 class WrongRoleError(RuntimeError):
@@ -212,6 +222,15 @@ class Engine:
         self._follow_gone(ended, now)
         self._role.on_view(left | self.peers.refused.keys(), now)
         return None
+
+    def removed_peers(self, since: float, at_most: int) -> list[RemovedPeerView]:
+        """Return the peers that the control plane removed after `since` (s), the last one first; kept ones always."""
+        found: list[RemovedPeerView] = []
+        for name, removal in self.removals.latest():
+            kept = "path" if name in self.peers else "dormant" if self.peers.is_dormant(name) else None
+            if kept or removal.at > since:
+                found.append(RemovedPeerView(name, removal, kept))
+        return found[:at_most]
 
     def services_of_peers(self) -> set[ServiceName]:
         """Return the services that the peers offer, whatever their names."""

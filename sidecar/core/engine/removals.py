@@ -60,6 +60,6 @@ class Removals:
             self._removals.popitem(last=False)
             self._dropped["removal_forgotten"] += 1
 
-    def latest(self, at_most: int) -> list[tuple[NodeName, Removal]]:
-        """Return the latest removals, the last one first."""
-        return list(reversed(self._removals.items()))[:at_most]
+    def latest(self) -> list[tuple[NodeName, Removal]]:
+        """Return the removals, the last one first."""
+        return list(reversed(self._removals.items()))

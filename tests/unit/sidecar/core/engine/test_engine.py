@@ -7,7 +7,7 @@ import pytest
 from lab.simulated.sessions import credential_of, session_of
 from plr.protos.model.ids import InterfaceName, NodeName, Role, ServiceName, SessionId, Version
 from plr.protos.model.mapping import Assignment, MappingSet, ServiceMapping
-from plr.protos.model.members import Peer, PeerSet, ServiceOffer, ServiceUse
+from plr.protos.model.members import Peer, PeerSet, RemovalReason, RemovedPeer, ServiceOffer, ServiceUse
 from plr.protos.model.redundancy_mode import RedundancyMode
 from plr.sidecar.core.base.report_scope import ReportScope
 from plr.sidecar.core.base.values import PathId, PathState, Priority, RejectReason
@@ -377,6 +377,33 @@ def test_a_dormant_peer_is_a_peer_again_when_a_path_to_it_lives() -> None:
     sidecar.engine.handle_timer(9.0)
     (told,) = (command for command in sidecar.take()[0] if isinstance(command, SetPeers))
     assert not told.peers[0].dormant
+
+
+def test_a_removed_peer_is_told_with_the_reason_and_what_is_kept_of_it() -> None:
+    sidecar = robot()
+    expired = RemovedPeer(A, RemovalReason.LEASE_EXPIRED)
+
+    def told(now: float) -> list[tuple[float, str | None]]:
+        found = sidecar.engine.removed_peers(now - 60.0, 9)
+        assert all((one.name, one.removal.reason) == (A, expired.reason) for one in found)
+        return [(one.removal.at, one.kept) for one in found]
+
+    assert sidecar.engine.apply_peers(PeerSet(Version(2), 1, (), (expired,)), 3.0) is None
+    assert told(10.0) == [(3.0, "path")]
+    sidecar.change(PathState.DOWN, 4.0)
+    assert told(10.0) == told(9000.0) == [(3.0, "dormant")]
+    assert sidecar.engine.apply_peers(PeerSet(Version(3), 1, (peer(A),)), 5.0) is None
+    assert told(10.0) == []
+
+
+def test_paths_of_a_peer_that_goes_at_once_end_with_the_reason() -> None:
+    sidecar = robot()
+    left = RemovedPeer(A, RemovalReason.LEFT)
+    assert sidecar.engine.apply_peers(PeerSet(Version(2), 1, (), (left,)), 3.0) is None
+    (told,) = (command for command in sidecar.take()[0] if isinstance(command, SetPeers))
+    assert told == SetPeers((), {A: "removed by the control plane: it was stopped"})
+    assert [(one.removal.at, one.kept) for one in sidecar.engine.removed_peers(0.0, 9)] == [(3.0, None)]
+    assert not sidecar.engine.removed_peers(3600.0, 9)
 
 
 def test_a_dormant_robot_may_come_back_in_a_later_session() -> None:

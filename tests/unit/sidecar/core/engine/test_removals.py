@@ -19,22 +19,22 @@ def test_a_removal_keeps_its_reason_and_time_until_the_view_lists_the_peer_again
     removals = Removals(Counter())
     removals.follow(view(cloud_a=EXPIRED), [A, B], 5.0)
     removals.follow(view(cloud_a=EXPIRED), [A], 9.0)
-    assert dict(removals.latest(9)) == {A: Removal(EXPIRED, 5.0), B: Removal(None, 5.0)}
+    assert dict(removals.latest()) == {A: Removal(EXPIRED, 5.0), B: Removal(None, 5.0)}
     removals.follow(view(peer(A)), [A], 10.0)
-    assert removals.latest(9) == [(B, Removal(None, 5.0))]
+    assert removals.latest() == [(B, Removal(None, 5.0))]
 
 
 def test_a_later_and_graver_reason_counts() -> None:
     removals = Removals(Counter())
     removals.follow(view(cloud_a=EXPIRED), [A, B], 5.0)
     removals.follow(view(cloud_a=REVOKED), [], 7.0)
-    assert removals.latest(1) == [(A, Removal(REVOKED, 7.0))]
+    assert removals.latest()[:1] == [(A, Removal(REVOKED, 7.0))]
 
 
 def test_nobody_is_remembered_who_was_no_peer() -> None:
     removals = Removals(Counter())
     removals.follow(view(stranger=REVOKED), [A], 5.0)
-    assert [name for name, _ in removals.latest(9)] == [A]
+    assert [name for name, _ in removals.latest()] == [A]
 
 
 def test_the_one_removed_first_is_forgotten() -> None:
@@ -42,8 +42,8 @@ def test_the_one_removed_first_is_forgotten() -> None:
     removals = Removals(dropped)
     for number in range(MAX_REMOVALS + 3):
         removals.follow(view(), [NodeName(f"n{number}")], float(number))
-    assert len(removals.latest(2 * MAX_REMOVALS)) == MAX_REMOVALS
-    assert removals.latest(1)[0][0] == f"n{MAX_REMOVALS + 2}"
+    assert len(removals.latest()) == MAX_REMOVALS
+    assert removals.latest()[0][0] == f"n{MAX_REMOVALS + 2}"
     assert dropped == {"removal_forgotten": 3}
 
 
