@@ -379,6 +379,17 @@ def test_a_dormant_peer_is_a_peer_again_when_a_path_to_it_lives() -> None:
     assert not told.peers[0].dormant
 
 
+def test_an_unlisted_peer_that_comes_and_goes_all_the_time_makes_links_no_work() -> None:
+    sidecar = silent_cloud()
+    for _ in range(1000):
+        sidecar.change(PathState.UP, 0.5)
+        assert ROBOT in sidecar.engine.peers
+        sidecar.engine.on_link_event(PeerClosed(ROBOT, SessionId(1)), 0.5)
+        assert sidecar.engine.peers.is_dormant(ROBOT)
+    sidecar.engine.handle_timer(SWEEP_EVERY_S)
+    assert sum(isinstance(command, SetPeers) for command in sidecar.take()[0]) == 1
+
+
 def test_a_removed_peer_is_told_with_the_reason_and_what_is_kept_of_it() -> None:
     sidecar = robot()
     expired = RemovedPeer(A, RemovalReason.LEASE_EXPIRED)
