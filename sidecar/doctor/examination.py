@@ -19,7 +19,7 @@ from plr.protos.trust.identity import Identity, IdentityRole
 from plr.sidecar.config.service_user import unreadable
 from plr.sidecar.config.sidecar import load_config
 from plr.sidecar.core.rules.service_rule import Rules
-from plr.sidecar.doctor import host, node_checks, running_checks
+from plr.sidecar.doctor import host, node_checks, removed_peers, running_checks
 from plr.sidecar.doctor.finding import fail, ok, warn
 from plr.sidecar.doctor.running_checks import Pinged
 from plr.sidecar.local.client import LocalBusyError, LocalClient, LocalError, LocalRefusedError
@@ -335,7 +335,8 @@ def _running(config: SidecarConfig | None, state: dict[str, Any], pings: Mapping
     yield from _judged(running_checks.stun, state)
     yield from _judged(running_checks.mtu, state)
     yield from _judged(lambda told: running_checks.paths(told, pings), state)
-    yield from _judged(running_checks.gone, state)
+    yield from _judged(removed_peers.findings, state)
+    yield from _judged(lambda told: running_checks.gone(removed_peers.without(told)), state)
     yield from _judged(running_checks.services, state)
     yield from _judged(lambda told: running_checks.mapping(told, target), state)
     yield from _judged(running_checks.control, state)

@@ -155,6 +155,13 @@ class _RefusedPeer(_Entry):
     why: Text
 
 
+class _RemovedPeer(_Entry):
+    name: Text
+    since_s: float
+    reason: Text | None = None
+    kept: Text | None = None
+
+
 class _Gone(_Entry):
     interface: Text
     peer: Text
@@ -203,6 +210,7 @@ _KINDS: dict[str, Any] = {
     "mapping": _Mapping,
     "mapped": list[_Mapped],
     "refused_peers": list[_RefusedPeer],
+    "removed_peers": list[_RemovedPeer],
     "gone": list[_Gone],
     "paths": list[_Path],
     "pinged": list[_PathName],

@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from plr.sidecar.config.sidecar import SidecarConfig
     from plr.sidecar.control.client import ControlView
     from plr.sidecar.core.base.values import PathId
+    from plr.sidecar.core.engine.engine import RemovedPeerView
     from plr.sidecar.net.dataplane import ThreadedDataPlane
     from plr.sidecar.net.interface_manager import InterfaceView
     from plr.sidecar.ros.stats import BridgeStats
@@ -34,7 +35,8 @@ if TYPE_CHECKING:
 PATHS_A_PART = 16
 SERVICES_A_PART = 16
 GONE_S, MAX_GONE = 3600.0, 64
-"""Time for which paths to nodes that are no longer peers are reported, and most of them."""
+"""Time for which paths to nodes that are no longer peers are reported, and most of them. The same holds for peers that
+the control plane removed, except that those that are still kept are reported for as long."""
 MAX_REFUSED_PEERS = 64
 """Most refused peers shown."""
 ENVIRONMENT = (
@@ -93,6 +95,7 @@ class LocalState:
         yield from self._services(now)
         refused = self.data_plane.peer_trust.refused(MAX_REFUSED_PEERS)
         yield "refused_peers", [{"name": name, "why": why} for name, why in refused]
+        yield "removed_peers", [_removed(one, now) for one in self.data_plane.removed_peers(now - GONE_S, MAX_GONE)]
         gone = self.data_plane.gone_paths(now - GONE_S, MAX_GONE)
         yield (
             "gone",
@@ -233,6 +236,16 @@ class LocalState:
                     for view, change in part
                 ],
             )
+
+
+def _removed(peer: RemovedPeerView, now: float) -> dict[str, Any]:
+    reason = peer.removal.reason
+    return {
+        "name": peer.name,
+        "reason": None if reason is None else reason.value,
+        "since_s": max(0.0, now - peer.removal.at),
+        "kept": peer.kept,
+    }
 
 
 def _interface(view: InterfaceView, now: float) -> dict[str, Any]:

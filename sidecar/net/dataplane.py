@@ -34,6 +34,7 @@ if TYPE_CHECKING:
     from plr.sidecar.core.base.report_scope import ReportScope
     from plr.sidecar.core.base.values import ExecutionId, PathId, RejectReason, RequestId
     from plr.sidecar.core.crypto.session import OwnSession
+    from plr.sidecar.core.engine.engine import RemovedPeerView
     from plr.sidecar.core.message.decoding import Decoding
     from plr.sidecar.core.path.history import LivenessChange
     from plr.sidecar.core.path.view import PathView
@@ -266,6 +267,11 @@ class ThreadedDataPlane:
             gone += [(path, last) for path, last in link.history.all().items() if path not in known]
         gone = [(path, last) for path, last in gone if last.state is PathState.DOWN and last.at > since]
         return sorted(gone, key=lambda one: -one[1].at)[:at_most]
+
+    def removed_peers(self, since: float, at_most: int) -> list[RemovedPeerView]:
+        """Return the peers that the control plane removed after `since` (monotonic, s), and those that are kept."""
+        with self._lock:
+            return self._engine.removed_peers(since, at_most)
 
     # -- what metrics and status read -----------------------------------------------------------------------------
 

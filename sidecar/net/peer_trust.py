@@ -64,7 +64,7 @@ class PeerTrust:
         """
         self._own.forget_admitted()
         with self._lock:
-            known, refused = self._engine.peers.all(), self._engine.peers.all_refused()
+            known, refused = self._engine.peers.all_held(), self._engine.peers.all_refused()
         self.judge(known)
         self._recheck(self.judge(refused))
 
@@ -75,7 +75,7 @@ class PeerTrust:
         """
         if self._own.forget_ended(now_wall):
             with self._lock:
-                known = self._engine.peers.all()
+                known = self._engine.peers.all_held()
             self.judge(known)
             self._recheck([])
         self.log_news()

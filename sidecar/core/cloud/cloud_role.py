@@ -187,6 +187,12 @@ class CloudRole:
         if len(self._away) > MAX_PEERS:
             self._end_session(next(iter(self._away)), now)
 
+    def on_peer_back(self, peer: NodeName, now: float) -> None:
+        """Note that a robot is back; if in a later session, end the one that fell silent."""
+        session = self._away.pop(peer, None)
+        if session is not None and session != self._parts.peers.session(peer):
+            self._end_session(peer, now)
+
     def _end_session(self, robot: NodeName, now: float) -> None:
         self._away.pop(robot, None)
         called_off = in_groups(partial(self._call_off, robot), self.executions.of_robot(robot))

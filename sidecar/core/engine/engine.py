@@ -7,7 +7,7 @@ application). Nothing here builds, seals or parses a datagram. What only one of 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 from plr.protos.base.errors import DecodeError, UnknownKindError
 from plr.protos.model.ids import Role
@@ -17,6 +17,7 @@ from plr.sidecar.core.base.slices import SLICE, Backlog
 from plr.sidecar.core.base.values import PathId, PathState
 from plr.sidecar.core.cloud.cloud_role import CloudRole
 from plr.sidecar.core.engine.peers import Peers
+from plr.sidecar.core.engine.removals import WHY_REMOVED, Removals
 from plr.sidecar.core.engine.revocation_exchange import RevocationExchange
 from plr.sidecar.core.robot.robot_role import RobotRole
 from plr.sidecar.core.rules.service_rule import Rules, ServiceRule
@@ -51,9 +52,10 @@ if TYPE_CHECKING:
 
     from plr.protos.model.ids import InterfaceName, NodeName, ServiceName, SessionId
     from plr.protos.model.mapping import MappingSet, ServiceMapping
-    from plr.protos.model.members import Peer, PeerSet, ServiceOffer, ServiceUse
+    from plr.protos.model.members import Peer, PeerSet, RemovedPeer, ServiceOffer, ServiceUse
     from plr.protos.model.report import Report
     from plr.sidecar.core.crypto.session import OwnSession
+    from plr.sidecar.core.engine.removals import Removal
     from plr.sidecar.core.engine.role import EngineRole
     from plr.sidecar.core.message.decoding import Decoding
     from plr.sidecar.core.rules.budget import Budget
@@ -73,6 +75,15 @@ class EngineConfig:
     """Robot: budgets, of which the first that matches an interface's name decides."""
 
 
+class RemovedPeerView(NamedTuple):
+    """A peer that the control plane removed, for people."""
+
+    name: NodeName
+    removal: Removal
+    kept: str | None
+    """`path`: it is a peer still, as a path to it lives; `dormant`; None: it is forgotten."""
+
+
 class WrongRoleError(RuntimeError):
     """The caller took this sidecar for one of the other role."""
 
@@ -89,6 +100,10 @@ class Engine:
         self._sweep_at = now + SWEEP_EVERY_S
         self._inbound = Inbound(self._commands.append, self.stats, answers=config.role is Role.CLOUD)
         self.peers = Peers(own, self.stats.dropped)
+        self.removals = Removals(self.stats.dropped)
+        self._links_lag = False
+        """Whether links are yet to be told which peers are dormant. That waits for the next sweep: a peer that comes
+        and goes all the time makes no more work than that."""
         self.routes = Routes()
         self._outbox = Outbox(self.routes, self._commands.append, self.stats)
         self.revocations = RevocationExchange(self.routes, self._outbox, self.stats)
@@ -141,8 +156,10 @@ class Engine:
         """Return the number of messages to decode."""
         return self._inbound.decodings
 
-    def _tell_links_of_peers(self) -> None:
-        self._commands.append(SetPeers(self.peers.for_links()))
+    def _tell_links_of_peers(self, removed: Iterable[RemovedPeer] = ()) -> None:
+        self._links_lag = False
+        why = {one.name: f"removed by the control plane: {WHY_REMOVED[one.reason]}" for one in removed}
+        self._commands.append(SetPeers(self.peers.for_links(), why))
 
     # -- the program ----------------------------------------------------------------------------------------------
 
@@ -181,20 +198,22 @@ class Engine:
             for path in paths:
                 self._role.on_path_gone(path, now)
             dark = dict.fromkeys(path.peer for path in paths if not self.routes.reaches(path.peer))
-            self._drop_unlisted(dark, now)
+            self._lay_down(dark, now)
         self._role.on_reach_changed(now)
         self._tell_links_of_peers()
 
     def apply_peers(self, peer_set: PeerSet, now: float) -> str | None:
         """Take a view of the peers; return why it is refused, or None."""
         before = {peer.name: peer.session for peer in self.peers.all()}
+        held = [peer.name for peer in (*self.peers.all_held(), *self.peers.all_refused())]
         left = {removed.name for removed in peer_set.removed if removed.reason is not RemovalReason.LEASE_EXPIRED}
         error = self.peers.apply(peer_set, self.routes.reaches)
         if error:
             self.stats.nacks += 1
             return error
         self.stats.peers_version = self.peers.version
-        self._tell_links_of_peers()
+        self.removals.follow(peer_set, held, now)
+        self._tell_links_of_peers(peer_set.removed)
         self._role.on_peers_changed(now)
         ended = [name for name, session in before.items() if self.peers.session(name) != session]
         for name in ended:
@@ -203,6 +222,15 @@ class Engine:
         self._follow_gone(ended, now)
         self._role.on_view(left | self.peers.refused.keys(), now)
         return None
+
+    def removed_peers(self, since: float, at_most: int) -> list[RemovedPeerView]:
+        """Return the peers that the control plane removed after `since` (s), the last one first; kept ones always."""
+        found: list[RemovedPeerView] = []
+        for name, removal in self.removals.latest():
+            kept = "path" if name in self.peers else "dormant" if self.peers.is_dormant(name) else None
+            if kept or removal.at > since:
+                found.append(RemovedPeerView(name, removal, kept))
+        return found[:at_most]
 
     def services_of_peers(self) -> set[ServiceName]:
         """Return the services that the peers offer, whatever their names."""
@@ -328,6 +356,9 @@ class Engine:
 
     def _on_path_changed(self, event: PathChanged, now: float) -> None:
         path, state = event.path, event.state
+        if state is PathState.UP and path.interface in self._interfaces and self.peers.wake(path.peer):
+            self._role.on_peer_back(path.peer, now)
+            self._links_lag = True
         if not self._knows(path) or self.routes.state(path) is state:
             return
         reached = self.routes.reaches(path.peer)
@@ -336,7 +367,7 @@ class Engine:
             self._backlog.add_steps(self._outbox.on_path_up(path), now)
             self._inbound.on_path_up(path)
         elif state is PathState.DOWN and not self.routes.reaches(path.peer):
-            self._drop_unlisted((path.peer,), now)
+            self._lay_down((path.peer,), now)
         if self.routes.reaches(path.peer) is not reached:
             self._role.on_reach_changed(now)
             if not reached:
@@ -346,20 +377,20 @@ class Engine:
     def _knows(self, path: PathId) -> bool:
         return path.peer in self.peers and path.interface in self._interfaces
 
-    def _drop_unlisted(self, dark: Iterable[NodeName], now: float) -> None:
-        """Drop those of these peers, whose last path died, that were kept for their paths only."""
-        dropped: dict[NodeName, SessionId | None] = {}
+    def _lay_down(self, dark: Iterable[NodeName], now: float) -> None:
+        """Make those of these peers, whose last path died, dormant that were kept for their paths only."""
+        dormant: dict[NodeName, SessionId | None] = {}
         for name in dark:
             session = self.peers.session(name)
-            if self.peers.drop_if_unlisted(name):
-                dropped[name] = session
-        if not dropped:
+            if self.peers.lay_down(name):
+                dormant[name] = session
+        if not dormant:
             return
         self._role.on_peers_changed(now)
-        for name, session in dropped.items():
+        for name, session in dormant.items():
             self._forget_session(name, now, may_return=session)
-        self._follow_gone(dropped, now)
-        self._tell_links_of_peers()
+        self._follow_gone(dormant, now)
+        self._links_lag = True
 
     def _on_peer_closed(self, name: NodeName, session: SessionId, now: float) -> None:
         """Send nothing new to a peer that said goodbye; the control plane will remove it as well."""
@@ -367,7 +398,7 @@ class Engine:
             self.routes.set_state(route.id, PathState.DOWN)
         self._role.on_closed(name, session, now)
         self._follow_gone((name,), now)
-        self._drop_unlisted((name,), now)
+        self._lay_down((name,), now)
 
     def _forget_session(self, name: NodeName, now: float, *, may_return: SessionId | None = None) -> None:
         """End a peer's session; with `may_return` it only fell silent, and may come back with it."""
@@ -406,4 +437,6 @@ class Engine:
             self._backlog.add_steps(self._outbox.expired(now), now)
             self._outbox.ask_again()
             self._inbound.expire(now)
+            if self._links_lag:
+                self._tell_links_of_peers()
         self._after_news(now)

@@ -6,9 +6,10 @@ prove it good, and the control plane, for which the view is in force, does not s
 are those that it signed itself (`announced.py`).
 
 A peer that merely vanished from the view (its lease ran out, or the control plane restarted with an empty registry)
-is kept while a path to it lives: a dead control plane must not cost a request. One that left, was revoked or is kept
-away by the access policy goes at once. So does every vanished peer when the policy changes, since nobody has said what
-it may do under the new one.
+is kept: a dead control plane must not cost a request. While a path to it lives, it stays a peer. Without one it is
+dormant (`dormant.py`): it gets nothing, but is answered when it talks again. One that left, was revoked or is kept away
+by the access policy goes at once. So does every vanished peer when the policy changes, since nobody has said what it
+may do under the new one.
 """
 
 from __future__ import annotations
@@ -19,10 +20,11 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from plr.protos.base.errors import DecodeError
-from plr.protos.model.ids import Version
+from plr.protos.model.ids import Role, Version
 from plr.protos.model.members import MAX_PEERS, NO_POLICY, POLICY_PENDING, PeerSet, RemovalReason
 from plr.protos.trust.identity import CertificateError
 from plr.sidecar.core.engine.announced import Announced
+from plr.sidecar.core.engine.dormant import Dormant, DormantPeers
 from plr.sidecar.core.engine.verification_budget import VerificationBudget
 from plr.sidecar.core.seam.links import LinkPeer
 
@@ -69,6 +71,7 @@ class Peers:
         """Refused peers of the view, so no more than `MAX_PEERS`."""
         self._announced = Announced(own, dropped)
         self._unlisted: set[NodeName] = set()
+        self._dormant = DormantPeers(own.credential.role, dropped)
         self._told: dict[NodeName, tuple[Peer, PairKeys, LinkPeer]] = {}
         """What links were told about each peer, and what that was made from."""
         self._restarted_at: dict[NodeName, float] = {}
@@ -91,6 +94,18 @@ class Peers:
     def all(self) -> list[Peer]:
         """Return all known peers."""
         return list(self._known.values())
+
+    def all_held(self) -> list[Peer]:
+        """Return all known peers and the dormant ones, which are judged with them."""
+        return [*self._known.values(), *(dormant.peer for dormant in self._dormant.all())]
+
+    def is_unlisted(self, name: NodeName) -> bool:
+        """Return whether this is a peer for its living paths only, as the view does not list it."""
+        return name in self._unlisted
+
+    def is_dormant(self, name: NodeName) -> bool:
+        """Return whether the peer is dormant."""
+        return name in self._dormant
 
     def apply(self, peer_set: PeerSet, reaches: Callable[[NodeName], bool]) -> str | None:
         """Take a new view; return why it is refused, or None. `reaches` returns whether a path to a peer lives."""
@@ -116,16 +131,26 @@ class Peers:
         self.refused = refused
         unlisted = set()
         new_policy = peer_set.policy not in (POLICY_PENDING, NO_POLICY, self._policy)
+        over = gone | known.keys() | refused.keys()
+
+        def may_not_return(peer: Peer) -> bool:
+            return new_policy or peer.name in over or peer.session in sessions
+
+        self._dormant.drop(may_not_return)
         for name, peer in self._known.items():
-            if new_policy or name in known or name in gone or peer.session in sessions or len(known) >= MAX_PEERS:
+            if may_not_return(peer):
                 continue
-            if reaches(name) and name not in self.refused:
+            if reaches(name) and len(known) < MAX_PEERS:
                 known[name], keys[name] = peer, self._keys[name]
                 unlisted.add(name)
+            else:
+                self._dormant.put(Dormant(peer, self._keys[name]))
+        self._dormant.make_room(len(known))
         self._known, self._keys = known, keys
         self._announced.forget_all_but(set(known))
-        self._restarted_at = {name: at for name, at in self._restarted_at.items() if name in known}
-        self._budget.keep(known)
+        held = {peer.name for peer in self.all_held()}
+        self._restarted_at = {name: at for name, at in self._restarted_at.items() if name in held}
+        self._budget.keep(known)  # the dormant ones too, until their buckets are full
         self._unlisted = unlisted
         if peer_set.policy != POLICY_PENDING:
             self._policy = peer_set.policy
@@ -144,7 +169,7 @@ class Peers:
 
     def _newer(self, listed: Peer) -> Peer:
         """Return the newer of a listed peer and what it proved by its introduction: the view may be older."""
-        known = self._known.get(listed.name)
+        known = self._held(listed.name)
         if known is None or known.token != listed.token or known.credential == listed.credential:
             return listed
         if (known.session, known.incarnation) == (listed.session, listed.incarnation):
@@ -159,13 +184,13 @@ class Peers:
     def restarted(self, event: PeerRestarted, now: float) -> bool:
         """Take a peer's newer session; False when it is not newer or proven, or comes too soon after another."""
         name, credential = event.peer, event.credential
-        peer = self._known.get(name)
+        peer = self._held(name)
         if peer is None or credential.incarnation <= peer.incarnation:
             return False
         restarted_at = self._restarted_at.get(name)
         if restarted_at is not None and now < restarted_at + RESTART_GAP_S:
             return False
-        if any(other.session == credential.session for other in self._known.values()):
+        if self._has_session(credential.session):
             return False
         newer = dataclasses.replace(
             peer, session=credential.session, incarnation=credential.incarnation, credential=credential.encode()
@@ -178,18 +203,37 @@ class Peers:
     def renewed(self, event: PeerRenewed, now: float) -> bool:
         """Take a renewed credential of a peer's session; False when it is not proven, or ends no later."""
         name, credential = event.peer, event.credential
-        peer = self._known.get(name)
+        peer = self._held(name)
         if peer is None or (peer.session, peer.incarnation) != (credential.session, credential.incarnation):
             return False
-        keys = self._keys[name]
+        keys = self._keys_of(name)
         renewed = dataclasses.replace(peer, credential=credential.encode())
         if renewed.credential == peer.credential or not self._introduced(renewed, now, at_home=event.at_home):
             return False
-        if self._keys[name] == keys and self._ends_at(renewed) > self._ends_at(peer):
+        if self._keys_of(name) == keys and self._ends_at(renewed) > self._ends_at(peer):
             return True
         # It has another session key, which our paths lack, or is the earlier one: a copy of an old introduction.
-        self._known[name], self._keys[name] = peer, keys
+        self._hold(peer, keys)
         return False
+
+    def _held(self, name: NodeName) -> Peer | None:
+        """Return a peer by name, dormant or not."""
+        dormant = self._dormant.get(name)
+        return self._known.get(name) if dormant is None else dormant.peer
+
+    def _keys_of(self, name: NodeName) -> PairKeys:
+        dormant = self._dormant.get(name)
+        return self._keys[name] if dormant is None else dormant.keys
+
+    def _hold(self, peer: Peer, keys: PairKeys) -> None:
+        """Replace what is known of a peer, which stays dormant if it is."""
+        if peer.name in self._dormant:
+            self._dormant.put(Dormant(peer, keys))
+        else:
+            self._known[peer.name], self._keys[peer.name] = peer, keys
+
+    def _has_session(self, session: SessionId) -> bool:
+        return any(peer.session == session for peer in self._known.values()) or self._dormant.has_session(session)
 
     def _introduced(self, peer: Peer, now: float, *, at_home: bool) -> bool:
         """Take a peer that proves itself; False when it does not, or when its credential is not verified now."""
@@ -197,11 +241,11 @@ class Peers:
             self._dropped["verifications_full"] += 1
             return False
         try:
-            self._keys[peer.name] = self._own.admit(peer)
+            keys = self._own.admit(peer)
         except DecodeError:
             self._dropped["bad_credential"] += 1
             return False
-        self._known[peer.name] = peer
+        self._hold(peer, keys)
         return True
 
     def _ends_at(self, peer: Peer) -> float:
@@ -215,7 +259,11 @@ class Peers:
         self._own.condemn(session)
 
     def recheck(self) -> list[NodeName]:
-        """Judge all peers again after a change of trust; return those dropped. See `OwnSession.forget_admitted`."""
+        """Judge all peers again after a change of trust; return those dropped. See `OwnSession.forget_admitted`.
+
+        Dormant ones that are bad now are forgotten: they were no peers any more.
+        """
+        self._dormant.drop(self._is_bad)
         gone = []
         for name, peer in list(self._known.items()):
             try:
@@ -227,6 +275,14 @@ class Peers:
                 self._forget(name)
                 gone.append(name)
         return gone
+
+    def _is_bad(self, peer: Peer) -> bool:
+        try:
+            self._own.admit(peer)
+        except DecodeError:
+            self._dropped["bad_credential"] += 1
+            return True
+        return False
 
     def all_refused(self) -> list[Peer]:
         """Return the refused peers: a corrected clock or new trust may prove them good."""
@@ -241,6 +297,8 @@ class Peers:
             # Skip it if a newer view came meanwhile, or another peer has taken its session since.
             if refusal is None or refusal.peer is not peer or peer.session in sessions:
                 continue
+            if self._dormant.has_session(peer.session):
+                continue
             if len(self._known) >= MAX_PEERS:
                 break
             try:
@@ -251,6 +309,7 @@ class Peers:
             sessions.add(peer.session)
             del self.refused[peer.name]
             taken.append(peer.name)
+        self._dormant.make_room(len(self._known))
         return taken
 
     def _forget(self, name: NodeName) -> None:
@@ -258,11 +317,24 @@ class Peers:
         self._restarted_at.pop(name, None)
         del self._known[name], self._keys[name]
 
-    def drop_if_unlisted(self, name: NodeName) -> bool:
-        """Drop a peer whose last path died if the view no longer lists it; return whether it was dropped."""
+    def lay_down(self, name: NodeName) -> bool:
+        """Make a peer whose last path died dormant if the view no longer lists it; return whether it is so now."""
         if name not in self._unlisted:
             return False
-        self._forget(name)
+        self._unlisted.discard(name)
+        self._dormant.put(Dormant(self._known.pop(name), self._keys.pop(name)))
+        self._dormant.make_room(len(self._known))
+        self._told.pop(name, None)
+        return True
+
+    def wake(self, name: NodeName) -> bool:
+        """Make a dormant peer a peer again, since a path to it lives; return False if it is not dormant."""
+        dormant = self._dormant.take(name)
+        if dormant is None:
+            return False
+        self._known[name], self._keys[name] = dormant
+        self._unlisted.add(name)
+        self._told.pop(name, None)
         return True
 
     def may_call(self, name: NodeName, service: ServiceName) -> bool:
@@ -276,21 +348,22 @@ class Peers:
         return None if peer is None else peer.session
 
     def for_links(self) -> tuple[LinkPeer, ...]:
-        """Return the peers as links need them."""
+        """Return the peers as links need them, the dormant ones included: links answer them."""
         told = {}
-        for name, peer in self._known.items():
-            keys = self._keys[name]
-            before = self._told.get(name)
-            if before is None or before[0] is not peer or before[1] is not keys:
-                before = peer, keys, _link_peer(peer, keys, self._announced.eras[name])
-            told[name] = before
+        awake = ((peer, self._keys[name], False) for name, peer in self._known.items())
+        for peer, keys, dormant in (*((*kept, True) for kept in self._dormant.all()), *awake):
+            before = self._told.get(peer.name)
+            if before is None or before[0] is not peer or before[1] is not keys or before[2].dormant is not dormant:
+                before = peer, keys, _link_peer(peer, keys, self._announced.eras[peer.name], dormant=dormant)
+            told[peer.name] = before
         self._told = told
         return tuple(link_peer for _, _, link_peer in told.values())
 
 
-def _link_peer(peer: Peer, keys: PairKeys, era: int) -> LinkPeer:
+def _link_peer(peer: Peer, keys: PairKeys, era: int, *, dormant: bool) -> LinkPeer:
     by_interface: dict[InterfaceId, list[Address]] = {}
-    for candidate in peer.candidates:
+    # A dormant robot has to come by itself, as it does after each outage. A NAT may let nobody else begin.
+    for candidate in () if dormant and peer.role is Role.ROBOT else peer.candidates:
         addresses = by_interface.setdefault(candidate.interface_id, [])
         if candidate.address not in addresses:
             addresses.append(candidate.address)
@@ -303,4 +376,5 @@ def _link_peer(peer: Peer, keys: PairKeys, era: int) -> LinkPeer:
         keys,
         tuple((interface, tuple(addresses)) for interface, addresses in sorted(by_interface.items())),
         era,
+        dormant,
     )

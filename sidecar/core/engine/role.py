@@ -82,6 +82,9 @@ class EngineRole(Protocol):
     def on_session_over(self, peer: NodeName, now: float, may_return: SessionId | None) -> None:
         """End a peer's session; with `may_return` it only fell silent, and may come back with it."""
 
+    def on_peer_back(self, peer: NodeName, now: float) -> None:
+        """Follow that a peer which fell silent is one again, since a path to it lives."""
+
     def on_peer_gone(self, peer: NodeName, now: float) -> None:
         """Expect nothing more from a peer whose session ended."""
 

@@ -50,7 +50,7 @@ from plr.sidecar.core.wire import frame
 if TYPE_CHECKING:
     import random
     from collections import deque
-    from collections.abc import Callable, Iterable, Iterator
+    from collections.abc import Callable, Iterable, Iterator, Mapping
 
     from plr.protos.model.ids import Address, NodeName
     from plr.sidecar.core.link.pinging import Pong
@@ -139,8 +139,8 @@ class Link:
                 path = self._paths.get((path_id.peer, path_id.remote))
                 if path is not None:
                     self._table.owe(path, frame.encode_forgotten(frame.Forgotten(number)))
-            case SetPeers(peers):
-                self._set_peers(peers, now)
+            case SetPeers(peers, removed):
+                self._set_peers(peers, removed, now)
             case SetCredential(credential):
                 self._renew(credential, now)
             case SetReady(ready):
@@ -220,20 +220,23 @@ class Link:
         return self._table.pings.done
 
     def path_ids(self) -> set[PathId]:
-        """Return the ids of all paths; any thread may ask."""
-        return {path.id for path in list(self._paths.values())}
+        """Return the ids of all paths, except those to dormant peers; any thread may ask."""
+        return {path.id for path in list(self._paths.values()) if not path.probing.dormant}
 
     def paths_to(self, peer: str) -> list[PathId]:
         """Return the paths to a peer; any thread may ask."""
         return [path.id for (name, _), path in self._paths.copy().items() if name == peer]
 
     def views(self, now: float) -> Iterator[PathView]:
-        """Yield the current view of each path. Any thread may ask: it reads what this link's thread writes.
+        """Yield the current view of each path, except those to dormant peers.
+
+        Any thread may ask: it reads what this link's thread writes.
 
         Each view costs that thread nothing but its turn of the interpreter; a caller with many may pause between them.
         """
         for path in list(self._paths.values()):
-            yield view_of(path, now)
+            if not path.probing.dormant:
+                yield view_of(path, now)
 
     def living(self) -> list[PathId]:
         """Return the paths that are not down."""
@@ -313,7 +316,7 @@ class Link:
             self._publish_stats_of(peer)
 
     def _publish_stats_of(self, peer: NodeName) -> None:
-        paths = self._table.to(peer)
+        paths = [path for path in self._table.to(peer) if not path.probing.dormant]
         if not paths:
             self.stats.paths.pop(peer, None)
             return
@@ -343,16 +346,19 @@ class Link:
         for path in self._paths.values():
             path.renew(now)
 
-    def _set_peers(self, peers: tuple[LinkPeer, ...], now: float) -> None:
+    def _set_peers(self, peers: tuple[LinkPeer, ...], removed: Mapping[NodeName, str], now: float) -> None:
         for path in self._table.set_peers(peers, now):
             if path.state is not PathState.DOWN:
-                self._keeper.take_down(path, "peer left or restarted")
+                self._keeper.take_down(path, removed.get(path.peer, "peer left or restarted"))
             if (path.peer, path.remote_id) not in self._paths:
                 self._dirty.pop(path.id, None)
                 self._unarmed.pop(path.id, None)
                 self._stirred.pop(path.id, None)
                 self._timers.arm(path.id, None)
                 self._publish_stats_of(path.peer)
+        for peer in peers:
+            if peer.dormant:
+                self._publish_stats_of(peer.name)
 
     # -- timers ---------------------------------------------------------------------------------------------------
 

@@ -217,6 +217,9 @@ class PathTable:
                         continue
                     self.dirty[path.id] = path
                 path.announced(addresses, crowd)
+                if path.probing.dormant is not peer.dormant:
+                    path.set_dormant(now, dormant=peer.dormant)
+                    self.dirty[path.id] = path
                 self._enter(path)
         for key, path in list(before.items()):
             known = self.by_session.get(path.session)

@@ -153,6 +153,12 @@ class Path:
         self.candidates = candidates
         self.probing.crowd = crowd
 
+    def set_dormant(self, now: float, *, dormant: bool) -> None:
+        """Note whether the peer is dormant. When that ends, the path is asked at once: the peer is likely back."""
+        if self.probing.dormant and not dormant and self.state is PathState.DOWN:
+            self.probing.begin_again(now)
+        self.probing.dormant = dormant
+
     def note_source(self, source: str | None) -> None:
         """Note the local address from which the kernel sends there; None while it is unknown."""
         self.source = source

@@ -35,6 +35,8 @@ MAX_PROBE_S = 1.0
 """... which backs off to this, so that a path that comes back is seen within a second, ..."""
 MAX_WATCH_PROBE_S = 15.0
 """... or to this at the end that does not lead: a thousand unreachable robots must not keep it busy."""
+MAX_DORMANT_PROBE_S = 900.0
+"""... or to this at the end that leads, if the peer is dormant (`engine/dormant.py`): it may be dead for good."""
 FREE_ADDRESSES = 16
 """A peer that announces more addresses has all of them probed that much less often until they answer: it gets no more
 datagrams out of us, wherever they lead."""
@@ -76,7 +78,7 @@ class Probing:
     """The schedule of one path's probes, and the memory of them. Times in seconds."""
 
     __slots__ = ("_asked_at", "_asked_every", "_back", "_gap", "_leads", "_out", "_proven_at", "_rng", "_used_at",
-                 "_was_up", "at", "crowd", "last_at")  # fmt: skip
+                 "_was_up", "at", "crowd", "dormant", "last_at")  # fmt: skip
 
     def __init__(self, now: float, rng: random.Random, *, leads: bool) -> None:
         """Create the schedule; `rng` must be unpredictable: who guesses an id could answer a probe he did not get."""
@@ -87,6 +89,8 @@ class Probing:
         """When the last probe left."""
         self.crowd = 0
         """Number of addresses that the peer announced, over all its interfaces."""
+        self.dormant = False
+        """Whether the peer is dormant; see MAX_DORMANT_PROBE_S."""
         self._leads = leads
         self._gap = FIRST_PROBE_S
         self._was_up = False
@@ -166,7 +170,10 @@ class Probing:
         """Do as `plan_up` for a path that is down."""
         self.at = now + self._gap * self._rng.uniform(1 - DOWN_SPREAD, 1 + DOWN_SPREAD)
         backoff = RETURN_BACKOFF if self._was_up else PROBE_BACKOFF
-        self._gap = min(self._gap * backoff, self._patience * (MAX_PROBE_S if self._leads else MAX_WATCH_PROBE_S))
+        longest = MAX_PROBE_S if self._leads else MAX_WATCH_PROBE_S
+        if self.dormant:
+            longest = MAX_DORMANT_PROBE_S
+        self._gap = min(self._gap * backoff, self._patience * longest)
 
     @property
     def _patience(self) -> float:

@@ -201,6 +201,10 @@ class RobotRole:
         """Drop what was meant for a server whose session is over: nobody answers it."""
         self._parts.backlog.add_steps(self._parts.outbox.drop_peer(peer), now)
 
+    def on_peer_back(self, _peer: NodeName, now: float) -> None:
+        """Offer what the server offers again."""
+        self.on_peers_changed(now)
+
     def on_peer_gone(self, peer: NodeName, now: float) -> None:
         """End the copies at a server whose session ended."""
         self.requests.on_peer_gone(peer, now)

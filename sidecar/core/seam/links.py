@@ -6,6 +6,8 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, NamedTuple
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     from plr.protos.model.ids import Address, InterfaceId, NodeName, SessionId
     from plr.protos.trust.credential import SessionCredential
     from plr.sidecar.core.base.values import PathId, PathState
@@ -29,6 +31,8 @@ class LinkPeer:
     """For each of the peer's interfaces, where it may be reached."""
     era: int = 0
     """How often the name passed to somebody new because its holder was revoked: the earlier sessions never return."""
+    dormant: bool = False
+    """Whether the control plane lost it and no path reached it: it is answered, but asked less and less often."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,6 +40,8 @@ class SetPeers:
     """Set all peers that may be talked to; a peer with a new session starts from scratch."""
 
     peers: tuple[LinkPeer, ...]
+    removed: Mapping[NodeName, str] = field(default_factory=dict)
+    """Why the control plane just removed some of those that may not be talked to any more, for people."""
 
 
 @dataclass(frozen=True, slots=True)

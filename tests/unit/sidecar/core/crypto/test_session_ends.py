@@ -74,14 +74,15 @@ def test_an_interface_that_vanishes_is_as_a_path_that_died(told_first: bool) -> 
     assert [type(event) for event in sidecar.take()[1]] == [WithdrawService]
 
 
-def test_a_peer_kept_only_for_its_paths_goes_with_the_last_interface() -> None:
+def test_a_peer_kept_only_for_its_paths_is_dormant_without_interfaces() -> None:
     sidecar = robot()
     sidecar.view(version=2)
     assert A in sidecar.engine.peers
     sidecar.take()
     sidecar.engine.set_interfaces((), 1.0)
     assert A not in sidecar.engine.peers
-    assert SetPeers(()) in sidecar.take()[0]
+    (told,) = (command for command in sidecar.take()[0] if isinstance(command, SetPeers))
+    assert [(peer.name, peer.dormant) for peer in told.peers] == [(A, True)]
 
 
 def answers_under_way(sidecar: Sidecar) -> int:

@@ -7,7 +7,7 @@ import pytest
 from lab.simulated.sessions import credential_of, session_of
 from plr.protos.model.ids import InterfaceName, NodeName, Role, ServiceName, SessionId, Version
 from plr.protos.model.mapping import Assignment, MappingSet, ServiceMapping
-from plr.protos.model.members import Peer, PeerSet, ServiceOffer, ServiceUse
+from plr.protos.model.members import Peer, PeerSet, RemovalReason, RemovedPeer, ServiceOffer, ServiceUse
 from plr.protos.model.redundancy_mode import RedundancyMode
 from plr.sidecar.core.base.report_scope import ReportScope
 from plr.sidecar.core.base.values import PathId, PathState, Priority, RejectReason
@@ -333,7 +333,13 @@ def test_a_cloud_that_drains_waits_only_for_what_is_awaited() -> None:
     assert sidecar.engine.busy == 0
 
 
-def test_a_peer_kept_only_for_its_paths_goes_with_the_last_of_them() -> None:
+def dormant(sidecar: Sidecar) -> list[NodeName]:
+    """The dormant peers that links were just told of."""
+    told = [command for command in sidecar.take()[0] if isinstance(command, SetPeers)]
+    return [peer.name for peer in told[-1].peers if peer.dormant] if told else []
+
+
+def test_a_peer_kept_only_for_its_paths_is_dormant_after_the_last_of_them() -> None:
     for goes in (PathChanged(path(), PathState.DOWN, ""), PeerClosed(A, SessionId(1))):
         sidecar = robot()
         sidecar.view(version=2)
@@ -341,7 +347,86 @@ def test_a_peer_kept_only_for_its_paths_goes_with_the_last_of_them() -> None:
         sidecar.take()
         sidecar.engine.on_link_event(goes, 0.2)
         assert A not in sidecar.engine.peers
-        assert SetPeers(()) in sidecar.take()[0]
+        assert not dormant(sidecar), "one that comes and goes costs links no work each time"
+        sidecar.engine.handle_timer(0.2 + SWEEP_EVERY_S)
+        assert dormant(sidecar) == [A]
+
+
+def silent_cloud() -> Sidecar:
+    """A cloud whose robot asked something, left the view, and fell silent."""
+    sidecar = cloud()
+    sidecar.receive(request(1))
+    sidecar.view(version=2)
+    sidecar.change(PathState.DOWN, 0.2)
+    assert ROBOT not in sidecar.engine.peers
+    sidecar.take()
+    return sidecar
+
+
+def test_a_dormant_peer_is_a_peer_again_when_a_path_to_it_lives() -> None:
+    sidecar = silent_cloud()
+    sidecar.receive(request(2))
+    assert sidecar.engine.stats.dropped["fragment_of_old_session"] == 1
+    sidecar.engine.on_link_event(PathChanged(path(WWAN, ROBOT), PathState.UP, ""), 1.0)
+    assert ROBOT not in sidecar.engine.peers, "we have no such interface"
+    sidecar.change(PathState.UP, 1.0)
+    assert ROBOT in sidecar.engine.peers
+    assert not sidecar.engine.cloud._away
+    sidecar.receive(request(3))
+    assert [type(event) for event in sidecar.take()[1]] == [ExecuteRequest]
+    sidecar.engine.handle_timer(9.0)
+    (told,) = (command for command in sidecar.take()[0] if isinstance(command, SetPeers))
+    assert not told.peers[0].dormant
+
+
+def test_an_unlisted_peer_that_comes_and_goes_all_the_time_makes_links_no_work() -> None:
+    sidecar = silent_cloud()
+    for _ in range(1000):
+        sidecar.change(PathState.UP, 0.5)
+        assert ROBOT in sidecar.engine.peers
+        sidecar.engine.on_link_event(PeerClosed(ROBOT, SessionId(1)), 0.5)
+        assert sidecar.engine.peers.is_dormant(ROBOT)
+    sidecar.engine.handle_timer(SWEEP_EVERY_S)
+    assert sum(isinstance(command, SetPeers) for command in sidecar.take()[0]) == 1
+
+
+def test_a_removed_peer_is_told_with_the_reason_and_what_is_kept_of_it() -> None:
+    sidecar = robot()
+    expired = RemovedPeer(A, RemovalReason.LEASE_EXPIRED)
+
+    def told(now: float) -> list[tuple[float, str | None]]:
+        found = sidecar.engine.removed_peers(now - 60.0, 9)
+        assert all((one.name, one.removal.reason) == (A, expired.reason) for one in found)
+        return [(one.removal.at, one.kept) for one in found]
+
+    assert sidecar.engine.apply_peers(PeerSet(Version(2), 1, (), (expired,)), 3.0) is None
+    assert told(10.0) == [(3.0, "path")]
+    sidecar.change(PathState.DOWN, 4.0)
+    assert told(10.0) == told(9000.0) == [(3.0, "dormant")]
+    assert sidecar.engine.apply_peers(PeerSet(Version(3), 1, (peer(A),)), 5.0) is None
+    assert told(10.0) == []
+
+
+def test_paths_of_a_peer_that_goes_at_once_end_with_the_reason() -> None:
+    sidecar = robot()
+    left = RemovedPeer(A, RemovalReason.LEFT)
+    assert sidecar.engine.apply_peers(PeerSet(Version(2), 1, (), (left,)), 3.0) is None
+    (told,) = (command for command in sidecar.take()[0] if isinstance(command, SetPeers))
+    assert told == SetPeers((), {A: "removed by the control plane: it was stopped"})
+    assert [(one.removal.at, one.kept) for one in sidecar.engine.removed_peers(0.0, 9)] == [(3.0, None)]
+    assert not sidecar.engine.removed_peers(3600.0, 9)
+
+
+def test_a_dormant_robot_may_come_back_in_a_later_session() -> None:
+    sidecar = silent_cloud()
+    credential = credential_of(ROBOT, Role.CLOUD, 2, 2)
+    sidecar.engine.on_link_event(PeerRestarted(ROBOT, credential, at_home=True), 1.0)
+    assert ROBOT not in sidecar.engine.peers
+    commands, events = sidecar.take()
+    assert [type(event) for event in events] == [CancelExecution]
+    assert [one.session for command in commands if isinstance(command, SetPeers) for one in command.peers] == [2]
+    sidecar.change(PathState.UP, 2.0)
+    assert sidecar.engine.peers.session(ROBOT) == 2
 
 
 def test_a_flood_of_restarts_makes_little_work() -> None:

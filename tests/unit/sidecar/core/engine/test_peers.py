@@ -58,13 +58,91 @@ def test_a_peer_that_vanished_is_kept_while_a_path_to_it_lives() -> None:
     peers = known(*HELD)
     peers.apply(view(), lambda name: name == A)
     assert peers.names() == [A]
-    assert peers.drop_if_unlisted(A)
+    assert peers.lay_down(A)
     assert A not in peers
+
+
+def asleep(*listed: Peer, policy: int = POLICY_PENDING) -> Peers:
+    """All listed peers vanished from the view, and no path reaches them."""
+    peers = Peers(OWN, Counter())
+    assert peers.apply(view(*listed, policy=policy), nobody) is None
+    assert peers.apply(view(policy=policy), nobody) is None
+    assert peers.names() == []
+    return peers
+
+
+def dormant(peers: Peers) -> list[NodeName]:
+    return [link_peer.name for link_peer in peers.for_links() if link_peer.dormant]
+
+
+def test_a_peer_that_vanished_without_a_path_is_dormant_and_wakes() -> None:
+    peers = asleep(*HELD)
+    assert dormant(peers) == [A, B]
+    assert [one.name for one in peers.all_held()] == [A, B]
+    assert not peers.may_call(A, ECHO)
+    assert peers.session(A) is None
+    assert peers.wake(A)
+    assert not peers.wake(A)
+    assert (peers.names(), dormant(peers), peers.session(A)) == ([A], [B], 1)
+    assert peers.is_unlisted(A)
+    peers.apply(view(HELD[1]), everybody)
+    assert (sorted(peers.names()), dormant(peers)) == ([A, B], [])
+
+
+@pytest.mark.parametrize("reason", list(RemovalReason))
+def test_a_dormant_peer_is_forgotten_for_each_reason_but_an_expired_lease(reason: RemovalReason) -> None:
+    peers = asleep(*HELD)
+    peers.apply(view(removed=(RemovedPeer(A, reason),)), nobody)
+    assert peers.is_dormant(A) is (reason is RemovalReason.LEASE_EXPIRED)
+    assert peers.is_dormant(B)
+
+
+def test_a_dormant_peer_is_forgotten_with_its_policy_its_session_or_its_trust() -> None:
+    peers = asleep(*HELD, policy=7)
+    peers.apply(view(policy=POLICY_PENDING), nobody)
+    assert dormant(peers) == [A, B]
+    peers.apply(view(policy=8), nobody)
+    assert dormant(peers) == []
+    peers = asleep(*HELD)
+    peers.apply(view(peer(NodeName("other"), session=1)), nobody)
+    assert dormant(peers) == [B]
+    own = session_of("robot-1", Role.ROBOT, 99)
+    peers = Peers(own, Counter())
+    peers.apply(view(*HELD), nobody)
+    peers.apply(view(), nobody)
+    own.condemn(HELD[0].session)
+    assert peers.recheck() == []
+    assert dormant(peers) == [B]
+
+
+def test_a_dormant_peer_may_restart_and_stays_dormant() -> None:
+    peers = asleep(*HELD)
+    assert not peers.restarted(restart(session=2), 1.0), "that is the session of another dormant peer"
+    assert peers.restarted(restart(), 1.0)
+    assert [one.session for one in peers.for_links()] == [9, 2]
+    assert dormant(peers) == [A, B]
+    peers.apply(view(HELD[0]), nobody)
+    assert peers.session(A) == 9, "the view is older than what the peer proved"
+
+
+def test_a_dormant_robot_is_not_asked_but_a_dormant_server_is() -> None:
+    robot, server = HELD[0], dataclasses.replace(HELD[1], role=Role.ROBOT)
+    server = with_credential(server)
+    peers = asleep(robot, server)
+    assert [bool(one.addresses) for one in peers.for_links()] == [True, False]
+
+
+def test_the_peers_and_the_dormant_ones_are_no_more_than_the_limit() -> None:
+    peers = asleep(*HELD)
+    many = [peer(NodeName(f"n{number}"), session=number + 10) for number in range(MAX_PEERS - 1)]
+    peers.apply(view(*many), nobody)
+    assert dormant(peers) == [B]
+    assert peers._dropped["dormant_full"] == 1
 
 
 def test_a_listed_peer_survives_the_death_of_its_paths() -> None:
     peers = known(*HELD)
-    assert not peers.drop_if_unlisted(A)
+    assert not peers.lay_down(A)
     assert A in peers
 
 
@@ -72,7 +150,7 @@ def test_a_peer_that_is_listed_again_is_no_longer_on_sufferance() -> None:
     peers = known(*HELD)
     peers.apply(view(), everybody)
     peers.apply(view(HELD[0]), everybody)
-    assert not peers.drop_if_unlisted(A)
+    assert not peers.lay_down(A)
 
 
 def test_one_whose_lease_expired_is_kept_one_that_left_or_was_revoked_goes_at_once() -> None:
@@ -265,7 +343,7 @@ def test_refused_peers_are_taken_once_they_are_judged_good() -> None:
     assert judge.looks == looks, "what was judged before the lock was taken is not judged again under it"
     assert [link_peer.name for link_peer in peers.for_links()] == [A]
     assert set(peers.refused) == {B}
-    assert not peers.drop_if_unlisted(A), "the view lists it"
+    assert not peers.lay_down(A), "the view lists it"
 
 
 def test_one_dropped_when_trust_changed_comes_back_with_its_trust_unless_the_view_lists_it_no_more() -> None:
@@ -308,5 +386,5 @@ def test_the_peers_taken_are_no_more_than_the_limit() -> None:
     assert A in peers, "kept for its paths, in the place of the refused one"
     judge.wrong.clear()
     assert peers.readmit(peers.all_refused()) == []
-    assert peers.drop_if_unlisted(A)
+    assert peers.lay_down(A)
     assert peers.readmit(peers.all_refused()) == [many[0].name]

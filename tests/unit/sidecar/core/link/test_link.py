@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import random
+from dataclasses import replace
 
 import pytest
 
@@ -278,6 +279,27 @@ def test_a_path_that_lives_outlives_a_view_that_forgot_it() -> None:
     assert state_changes(bench)[-1] is PathState.DOWN
     bench.link.execute(SetPeers((bench.link_peer(addresses=()),)), bench.now)
     assert bench.wait(10.0) == [], "nothing is left of it"
+
+
+def test_paths_to_a_removed_peer_end_with_the_reason() -> None:
+    bench = up()
+    bench.link.execute(SetPeers((), {PATH.peer: "removed by the control plane: it was stopped"}), bench.now)
+    changes = [event for event in bench.events() if isinstance(event, PathChanged)]
+    assert [(one.state, one.reason) for one in changes] == [
+        (PathState.DOWN, "removed by the control plane: it was stopped")
+    ]
+
+
+def test_a_dormant_peer_is_asked_rarely_and_at_once_when_it_is_one_again() -> None:
+    bench = up()
+    bench.link.execute(SetPeers((replace(bench.link_peer(), dormant=True),)), bench.now)
+    bench.wait(3600.0)
+    assert 1 <= len(bench.wait(120.0)) <= 4
+    assert not bench.link.stats.paths
+    assert not list(bench.link.views(bench.now))
+    assert not bench.link.path_ids(), "for people it is gone"
+    bench.link.execute(SetPeers((bench.link_peer(),)), bench.now)
+    assert bench.frames(bench.sent())
 
 
 def test_a_link_opened_again_goes_on_with_the_packet_numbers_of_the_one_before() -> None:

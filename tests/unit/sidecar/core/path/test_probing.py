@@ -7,10 +7,12 @@ import pytest
 
 from plr.sidecar.core.path.congestion.rtt import LONGEST_ANSWER_S
 from plr.sidecar.core.path.probing import (
+    DOWN_SPREAD,
     FIRST_PROBE_S,
     FREE_ADDRESSES,
     IDLE_PROBE_S,
     IDLE_SPREAD,
+    MAX_DORMANT_PROBE_S,
     MAX_IDLE_PROBE_S,
     MAX_PROBE_S,
     MAX_PROBES_OUT,
@@ -134,6 +136,25 @@ def test_what_is_down_is_looked_for_more_rarely_by_who_does_not_lead() -> None:
 
 
 @pytest.mark.audit("dp-11")
+def test_a_dormant_peer_is_asked_a_fiftieth_of_its_downtime_apart_and_ever_less_often() -> None:
+    subject = up()
+    subject.dormant = True
+    subject.begin_again(100.0)
+    asked = []
+    while subject.at < 100.0 + 7 * 86_400.0:
+        asked.append(subject.at)
+        subject.plan_down(subject.at)
+    after = [at - 100.0 for at in asked]
+    assert all(gap < 0.03 * at + 0.1 for at, gap in zip(after[1:], _gaps(after), strict=True))
+    assert max(_gaps(after)) <= MAX_DORMANT_PROBE_S * (1 + DOWN_SPREAD)
+    assert sum(at < 3600.0 for at in after) < 500
+    assert sum(at > 6 * 86_400.0 for at in after) < 1.2 * 86_400.0 / MAX_DORMANT_PROBE_S
+
+
+def _gaps(times: list[float]) -> list[float]:
+    return [later - at for at, later in itertools.pairwise(times)]
+
+
 @pytest.mark.parametrize("was_up", [False, True])
 def test_a_peer_of_many_addresses_gets_no_more_probes_than_one_of_some(was_up: bool) -> None:
     def asked(addresses: int) -> float:

@@ -1,0 +1,78 @@
+"""Keeps the peers that the control plane lost and no path reaches, so that they are answered when they talk again.
+
+A dormant peer costs its entry here and in the links: a cloud sends it nothing, a robot asks ever less often
+(`MAX_DORMANT_PROBE_S` in `probing.py`). Only peers that the view listed, and whose credentials were judged good, get
+here, each with one entry.
+"""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from typing import TYPE_CHECKING, NamedTuple
+
+from plr.protos.model.ids import Role
+from plr.protos.model.members import MAX_PEERS
+
+if TYPE_CHECKING:
+    from collections import Counter
+    from collections.abc import Callable
+
+    from plr.protos.model.ids import NodeName, SessionId
+    from plr.protos.model.members import Peer
+    from plr.sidecar.core.crypto.key_schedule import PairKeys
+
+MAX_DORMANT_SERVERS = 64
+"""Dormant servers of a robot, which asks each of them now and then over links that may be metered. A cloud asks nobody:
+its dormant robots and its other peers together are at most `MAX_PEERS`."""
+
+
+class Dormant(NamedTuple):
+    """A dormant peer, and the keys shared with it."""
+
+    peer: Peer
+    keys: PairKeys
+
+
+class DormantPeers:
+    """Dormant peers by name, the one dormant for longest first."""
+
+    def __init__(self, role: Role, dropped: Counter[str]) -> None:
+        """Create the table of a sidecar of this role."""
+        self._most = MAX_DORMANT_SERVERS if role is Role.ROBOT else MAX_PEERS
+        self._dropped = dropped
+        self._peers: OrderedDict[NodeName, Dormant] = OrderedDict()
+
+    def __contains__(self, name: object) -> bool:
+        return name in self._peers
+
+    def all(self) -> list[Dormant]:
+        """Return all of them."""
+        return list(self._peers.values())
+
+    def get(self, name: NodeName) -> Dormant | None:
+        """Return a dormant peer by name."""
+        return self._peers.get(name)
+
+    def put(self, dormant: Dormant) -> None:
+        """Add a peer; or replace what is known of it, which keeps its place in the order."""
+        self._peers[dormant.peer.name] = dormant
+
+    def take(self, name: NodeName) -> Dormant | None:
+        """Remove and return a peer; None if it is not dormant."""
+        return self._peers.pop(name, None)
+
+    def has_session(self, session: SessionId) -> bool:
+        """Return whether this is the session of a dormant peer."""
+        return any(dormant.peer.session == session for dormant in self._peers.values())
+
+    def drop(self, over: Callable[[Peer], bool]) -> None:
+        """Forget those that may not come back."""
+        for name, dormant in list(self._peers.items()):
+            if over(dormant.peer):
+                del self._peers[name]
+
+    def make_room(self, awake: int) -> None:
+        """Forget those dormant for longest until the rest fit beside `awake` other peers."""
+        while len(self._peers) > max(0, min(self._most, MAX_PEERS - awake)):
+            self._peers.popitem(last=False)
+            self._dropped["dormant_full"] += 1

@@ -1,0 +1,166 @@
+"""Members whose control plane alone is out of reach: it forgets them, and their links may go dark as well after that.
+
+The control plane reaches all others, and tells them that the lease expired.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import pytest
+
+from lab.simulated.mesh import SERVICE, Mesh, Node, rule
+from plr.controlplane.core.policy.policy import CallRule, OfferRule, Policy
+from plr.protos.model.ids import NodeName
+from plr.protos.model.members import RemovalReason
+from plr.sidecar.core.seam.links import SetReady
+from tests.sim.joined_planes import JoinedPlanes
+from tests.sim.nat import NatMesh
+
+if TYPE_CHECKING:
+    from plr.sidecar.core.base.values import RequestId
+
+EVERYBODY = (OfferRule(("*",), ("*",)),)
+SOON_S = 2.0
+"""Longer than a fiftieth of an outage, and a request."""
+LONG_S = 300.0
+"""A fiftieth of this is much longer."""
+
+
+class Trial:
+    """A robot with two interfaces behind NATs, and a cloud."""
+
+    def __init__(self, seed: int = 1, policy: Policy | None = None) -> None:
+        self.mesh: Mesh = NatMesh(seed)
+        self.robot = self.mesh.robot("wlan0", "wwan0", rules=(rule(lifetime_s=60.0),))
+        self.cloud = self.mesh.cloud("cloud-a")
+        self.planes = JoinedPlanes(self.mesh, policy)
+        self.planes.join(self.cloud, self.robot)
+        self.planes.run(3.0)
+
+    def lose(self, node: Node) -> None:
+        """Cut a node off from its control plane alone, until its lease has ended; its paths work."""
+        self.planes.leave(node)
+        self.planes.run(12.0)
+        assert self.is_answered(), "a dead control plane costs no request"
+
+    def dark(self, seconds: float) -> None:
+        """Cut all paths."""
+        wires = [wire for name in ("robot.wlan0", "robot.wwan0") for wire in self.mesh.all_wires_of(name)]
+        for wire in wires:
+            wire.cut = True
+        self.planes.run(seconds)
+        for wire in wires:
+            wire.cut = False
+
+    def ask(self) -> RequestId:
+        return self.robot.submit(b"request")
+
+    def is_answered(self, within_s: float = SOON_S) -> bool:
+        asked = self.ask()
+        self.planes.run(within_s)
+        return any(answer.request_id == asked for answer in self.robot.responses())
+
+    def other_end(self, lost: Node) -> Node:
+        return self.cloud if lost is self.robot else self.robot
+
+
+@pytest.mark.parametrize("seed", range(2))
+@pytest.mark.parametrize("who", ["robot", "cloud"])
+@pytest.mark.parametrize("dark_s", [10.0, 60.0])
+def test_a_tunnel_does_not_part_it_from_its_peers_for_good(who: str, dark_s: float, seed: int) -> None:
+    trial = Trial(seed)
+    lost = getattr(trial, who)
+    trial.lose(lost)
+    other = trial.other_end(lost)
+    trial.dark(dark_s)
+    assert other.engine.peers.is_dormant(lost.name)
+    trial.planes.run(SOON_S)
+    assert trial.is_answered()
+    assert other.engine.peers.is_unlisted(lost.name)
+    assert [(name, removal.reason) for name, removal in other.engine.removals.latest()] == [
+        (lost.name, RemovalReason.LEASE_EXPIRED)
+    ]
+
+
+def test_a_request_of_the_dark_is_answered_after_it() -> None:
+    trial = Trial()
+    trial.lose(trial.robot)
+    trial.mesh.at(25.0, lambda: asked.append(trial.ask()))
+    asked: list[RequestId] = []
+    trial.dark(30.0)
+    trial.planes.run(SOON_S)
+    assert asked[0] in {answer.request_id for answer in trial.robot.responses()}
+
+
+def test_a_robot_that_restarts_in_the_dark_is_answered() -> None:
+    trial = Trial()
+    trial.lose(trial.robot)
+    trial.dark(20.0)
+    before = trial.robot.session
+    view = trial.planes.peer_sets[trial.robot.name]
+    trial.robot.start()
+    assert trial.robot.session != before
+    assert trial.robot.engine.apply_peers(view, trial.mesh.now) is None
+    trial.planes.run(3 * SOON_S)
+    assert trial.is_answered()
+    assert trial.cloud.engine.peers.session(trial.robot.name) == trial.robot.session
+
+
+@pytest.mark.parametrize("who", ["robot", "cloud"])
+def test_a_dormant_peer_costs_next_to_nothing(who: str) -> None:
+    trial = Trial()
+    lost = getattr(trial, who)
+    trial.lose(lost)
+    other = trial.other_end(lost)
+    lost.alive = False
+    trial.planes.run(60.0)
+    assert other.engine.peers.is_dormant(lost.name)
+    sent = 0
+
+    def count(source: tuple[str, int], _to: object, data: bytes) -> None:
+        nonlocal sent
+        sent += len(data) if source[0].startswith(other.name) else 0
+
+    trial.mesh.tap = count
+    trial.mesh.run(3600.0)
+    first_hour, sent = sent, 0
+    if who == "robot":
+        assert first_hour == 0, "a cloud sends it nothing"
+    trial.mesh.run(8 * 3600.0)
+    assert sent / 8 <= first_hour / 3
+
+
+def test_a_robot_asks_a_dormant_server_at_once_when_its_own_link_is_new() -> None:
+    trial = Trial()
+    trial.lose(trial.cloud)
+    trial.dark(LONG_S)
+    for link in trial.robot.links.values():
+        link.execute(SetReady(ready=True), trial.mesh.now)
+    trial.mesh.pump(trial.robot)
+    trial.planes.run(0.5)
+    assert not trial.robot.engine.peers.is_dormant(trial.cloud.name)
+    assert trial.is_answered()
+
+
+def test_a_listed_server_that_was_dormant_is_asked_at_once() -> None:
+    trial = Trial()
+    trial.lose(trial.cloud)
+    trial.dark(LONG_S)
+    del trial.planes.told[trial.cloud.name]
+    trial.planes.join(trial.cloud)
+    trial.planes.run(SOON_S)
+    assert not trial.robot.engine.peers.is_dormant(trial.cloud.name)
+    assert trial.is_answered()
+    assert trial.robot.engine.removals.latest() == []
+
+
+def test_a_new_policy_ends_what_is_dormant() -> None:
+    trial = Trial(policy=Policy((CallRule(("*",), (SERVICE,), ("*",)),), EVERYBODY))
+    trial.lose(trial.robot)
+    trial.dark(20.0)
+    assert trial.cloud.engine.peers.is_dormant(trial.robot.name)
+    trial.planes.core.set_policy(Policy((CallRule(("someone",), (SERVICE,), ("*",)),), EVERYBODY), trial.mesh.now)
+    trial.planes.run(SOON_S)
+    assert not trial.cloud.engine.peers.is_dormant(NodeName("robot"))
+    assert not trial.is_answered()

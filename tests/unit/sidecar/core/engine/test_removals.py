@@ -1,0 +1,51 @@
+from __future__ import annotations
+
+from collections import Counter
+
+from plr.protos.model.ids import NodeName, Version
+from plr.protos.model.members import Peer, PeerSet, RemovalReason, RemovedPeer
+from plr.sidecar.core.engine.removals import MAX_REMOVALS, WHY_REMOVED, Removal, Removals
+from tests.support.builders import A, B, peer
+
+EXPIRED, REVOKED = RemovalReason.LEASE_EXPIRED, RemovalReason.REVOKED
+
+
+def view(*listed: Peer, **removed: RemovalReason) -> PeerSet:
+    notices = tuple(RemovedPeer(NodeName(name.replace("_", "-")), reason) for name, reason in removed.items())
+    return PeerSet(Version(1), 1, listed, notices)
+
+
+def test_a_removal_keeps_its_reason_and_time_until_the_view_lists_the_peer_again() -> None:
+    removals = Removals(Counter())
+    removals.follow(view(cloud_a=EXPIRED), [A, B], 5.0)
+    removals.follow(view(cloud_a=EXPIRED), [A], 9.0)
+    assert dict(removals.latest()) == {A: Removal(EXPIRED, 5.0), B: Removal(None, 5.0)}
+    removals.follow(view(peer(A)), [A], 10.0)
+    assert removals.latest() == [(B, Removal(None, 5.0))]
+
+
+def test_a_later_and_graver_reason_counts() -> None:
+    removals = Removals(Counter())
+    removals.follow(view(cloud_a=EXPIRED), [A, B], 5.0)
+    removals.follow(view(cloud_a=REVOKED), [], 7.0)
+    assert removals.latest()[:1] == [(A, Removal(REVOKED, 7.0))]
+
+
+def test_nobody_is_remembered_who_was_no_peer() -> None:
+    removals = Removals(Counter())
+    removals.follow(view(stranger=REVOKED), [A], 5.0)
+    assert [name for name, _ in removals.latest()] == [A]
+
+
+def test_the_one_removed_first_is_forgotten() -> None:
+    dropped: Counter[str] = Counter()
+    removals = Removals(dropped)
+    for number in range(MAX_REMOVALS + 3):
+        removals.follow(view(), [NodeName(f"n{number}")], float(number))
+    assert len(removals.latest()) == MAX_REMOVALS
+    assert removals.latest()[0][0] == f"n{MAX_REMOVALS + 2}"
+    assert dropped == {"removal_forgotten": 3}
+
+
+def test_each_reason_has_words() -> None:
+    assert WHY_REMOVED.keys() == set(RemovalReason)
