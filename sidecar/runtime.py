@@ -259,6 +259,7 @@ class SidecarRuntime:
             data_plane=self._data_plane,
             interfaces=self._interfaces.views,
             idle=self._interfaces.in_use,
+            stun_servers=lambda: self._interfaces.stun_servers,
             unopened=self._interfaces.unopened,
             control=self._control.view,
             bridge=lambda: self._bridge.stats,

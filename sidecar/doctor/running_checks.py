@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 from plr.sidecar.core.path.pmtu import HEADERS_V4, HEADERS_V6, LEAST_MTU
 from plr.sidecar.core.wire.frame import BASE_BYTES
+from plr.sidecar.doctor import losses
 from plr.sidecar.doctor.finding import duration, fail, milliseconds, ok, share, warn
 
 if TYPE_CHECKING:
@@ -30,10 +31,10 @@ STARTED_S = 20.0
 """Peers are known and probed within this time after the start."""
 MAX_SHOWN_GONE = 8
 """Lines about nodes that are no longer peers."""
+MAX_SHOWN_STUN = 3
+"""STUN servers named in a remedy."""
 GOODBYE = "peer closed"
 """Reason for a path going down when its node ended in order."""
-LOSSY = 0.05
-"""Loss rate of datagrams above which a path gets a warning."""
 HOPELESS = 0.5
 """Predicted misses above which a service without a target gets a warning."""
 SHARED_ADDRESSES = ip_network("100.64.0.0/10")
@@ -103,7 +104,7 @@ def stun(state: State) -> Iterator[Finding]:
             if answered:
                 yield ok("stun", f"{what} ({why}): harmless, because the other family gets answers")
             else:
-                remedy = "3478/udp of the control plane, a route over this interface, rp_filter"
+                remedy = f"{_stun_ports(state)}, a route over this interface, rp_filter"
                 yield warn("stun", f"{what}: {why}", f"check {remedy}: docs/operate/troubleshooting.md, STUN fails")
         if interface["stun"]:
             continue
@@ -118,6 +119,15 @@ def stun(state: State) -> Iterator[Finding]:
             yield warn(
                 "stun", f"{interface['name']}: no STUN server is known", "check that the control plane's name resolves"
             )
+
+
+def _stun_ports(state: State) -> str:
+    """Return which ports have to be open: those of the servers that the sidecar asks."""
+    servers = (state.get("node") or {}).get("stun_servers")
+    if not servers:  # an earlier version does not report them
+        return "the UDP port of the STUN servers"
+    shown = [f"{port}/udp of {host}" for host, port in (server.rsplit(":", 1) for server in servers[:MAX_SHOWN_STUN])]
+    return ", ".join(shown) + (f" and of {len(servers) - MAX_SHOWN_STUN} more" if len(servers) > MAX_SHOWN_STUN else "")
 
 
 def _is_fresh(one: Mapping[str, Any]) -> bool:
@@ -234,13 +244,17 @@ def paths(state: State, pings: Mapping[PathKey, Pinged]) -> Iterator[Finding]:
                 f"{name}: not reached over {_over(ones or by_peer[name])}, but others are: {_why(by_peer[name])}",
                 f"check that the host of {name} is up, its sidecar runs and its UDP port is open",
             )
-    told = {(path["interface"], path["peer"]) for path in state["paths"] if not _is_down(path)}
-    for path in sorted(state["paths"], key=lambda one: (one["peer"], one["interface"], one["remote"])):
+    ones = sorted(state["paths"], key=lambda one: (one["peer"], one["interface"], one["remote"]))
+    blame = losses.blame(ones)
+    yield from blame.findings
+    told = {(path["interface"], path["peer"]) for path in ones if not _is_down(path)}
+    for number, path in enumerate(ones):
         blamed = path["interface"] in dark_interfaces or path["peer"] in dark_peers
         # It is normal that a further interface of a peer (IPv6-only, an inner network) is not reached from here.
         if _is_down(path) and (blamed or (path["interface"], path["peer"]) in told):
             continue
-        yield _path(path, pings.get((path["interface"], path["peer"], path["remote"])))
+        pinged = pings.get((path["interface"], path["peer"], path["remote"]))
+        yield _path(path, pinged, blame.explained.get(number))
 
 
 def gone(state: State) -> Iterator[Finding]:
@@ -264,7 +278,8 @@ def gone(state: State) -> Iterator[Finding]:
         yield ok("peer", f"{len(left) - MAX_SHOWN_GONE} more nodes were peers within the last hour")
 
 
-def _path(path: Mapping[str, Any], pinged: Pinged | None) -> Finding:
+def _path(path: Mapping[str, Any], pinged: Pinged | None, blamed: str | None) -> Finding:
+    """Judge one path; `blamed` is what its losses are blamed on, if not on itself."""
     where = "" if path["address"] is None else f" ({_shown(*path['address'])})"
     since = "" if path["since_s"] is None else f" for {duration(path['since_s'])}"
     name = f"{path['interface']} to {path['peer']}{where}"
@@ -272,9 +287,8 @@ def _path(path: Mapping[str, Any], pinged: Pinged | None) -> Finding:
         why = f", {path['reason']}" if path["reason"] else ""
         remedy = f"ping -I {path['interface']} {path['address'][0] if path['address'] else path['peer']}"
         return warn("path", f"{name}: down{since}{why}", f"{remedy}; docs/operate/troubleshooting.md, A path is down")
-    lost = path["lost"] / path["sent"] if path["sent"] else 0.0
     measured = f"round trip {milliseconds(path['rtt_s'])}" if path["rtt_s"] else "round trip unknown"
-    text = f"{name}: {path['state']}{since}, {measured}, {share(lost)} lost"
+    text = f"{name}: {path['state']}{since}, {measured}, {losses.told(path)}"
     if path["rests"]:
         text += f", at rest (last heard {duration(path['proven_s'])} ago)"
     if pinged is not None and pinged.sent <= 0 and pinged.problem:
@@ -287,8 +301,10 @@ def _path(path: Mapping[str, Any], pinged: Pinged | None) -> Finding:
         text += f"; ping {fastest} to {slowest}, {pinged.sent - len(pinged.rtts_s)} of {pinged.sent} lost"
     if path["state"] != "up":
         return warn("path", text, f"the path may be about to go down: plr ping {path['peer']} -I {path['interface']}")
-    if lost > LOSSY and path["sent"] >= 100:
-        return warn("path", text, "check the carrier: the signal may be weak, or a queue full")
+    if losses.is_lossy(path):
+        if blamed is not None:
+            return ok("path", f"{text}: see {blamed} above")
+        return warn("path", text, f"check the carrier: the signal may be weak, or a queue full; {losses.SEE}")
     return ok("path", text)
 
 

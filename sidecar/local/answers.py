@@ -52,6 +52,7 @@ class _Node(_Entry):
     up_s: float = 0.0
     insecure: bool = False
     stun: bool = True
+    stun_servers: list[Text] = []
     ros_problem: Text = ""
     left_out_peers: list[Text] = []
     environment: dict[Text, Text] = {}
@@ -162,6 +163,12 @@ class _Gone(_Entry):
     reason: Text
 
 
+class _Recent(_Entry):
+    window_s: float
+    sent: Whole
+    lost: Whole
+
+
 class _Path(_Entry):
     interface: Text
     peer: Text
@@ -174,6 +181,7 @@ class _Path(_Entry):
     rtt_s: float | None = None
     sent: Whole = 0
     lost: Whole = 0
+    recent: _Recent | None = None
     max_datagram: Whole = 0
     proven_s: float = 0.0
     rests: bool = False

@@ -65,6 +65,8 @@ class LocalState:
     interfaces: Callable[[], Iterable[InterfaceView]]
     idle: Callable[[], Mapping[InterfaceName, bool]]
     """Return the wanted interfaces, and whether each can carry something."""
+    stun_servers: Callable[[], tuple[str, ...]]
+    """Return the STUN servers in use, as host and port; empty before the first are known."""
     unopened: Callable[[], Mapping[InterfaceName, str]]
     """Return the interfaces whose sockets could not be opened, and why."""
     control: Callable[[], ControlView]
@@ -129,6 +131,7 @@ class LocalState:
             "up_s": now - self.started_at,
             "insecure": config.insecure,
             "stun": config.stun.enabled,
+            "stun_servers": list(self.stun_servers()),
             "ros_problem": bridge.not_started,
             "left_out_peers": list(bridge.left_out_peers),
             "environment": {name: _told(os.environ[name]) for name in ENVIRONMENT if name in os.environ},
@@ -226,6 +229,7 @@ class LocalState:
                         "rtt_s": view.smoothed_rtt_s,
                         "sent": view.sent,
                         "lost": max(0, view.lost - view.spurious),
+                        "recent": view.recent._asdict(),
                         "max_datagram": view.max_datagram,
                         "proven_s": max(0.0, now - view.proven_at),
                         "rests": view.state is PathState.UP and view.probe_every_s > 1.0,

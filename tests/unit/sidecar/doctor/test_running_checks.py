@@ -23,8 +23,13 @@ def path(interface: str, peer: str, state: str = "up", **changes: Any) -> dict[s
     return {
         "interface": interface, "peer": peer, "remote": 0, "address": ["192.0.2.1", 24700], "candidates": 1,
         "state": state, "since_s": 600.0, "reason": "answers" if state == "up" else "silent", "rtt_s": 0.02,
-        "sent": 1000, "lost": 1, "max_datagram": 1472, "proven_s": 0.2, "rests": False, **changes,
+        "sent": 1000, "lost": 1, "recent": {"window_s": 50.0, "sent": 500, "lost": 1},
+        "max_datagram": 1472, "proven_s": 0.2, "rests": False, **changes,
     }  # fmt: skip
+
+
+def losing(interface: str, peer: str, lost: int = 50, **changes: Any) -> dict[str, Any]:
+    return path(interface, peer, recent={"window_s": 50.0, "sent": 500, "lost": lost}, **changes)
 
 
 def stun(**changes: Any) -> dict[str, Any]:
@@ -126,8 +131,8 @@ def test_pings_are_shown_and_missed_ones_warned_of() -> None:
 
 
 def test_a_lossy_or_unstable_path_is_warned_of() -> None:
-    lossy = state(paths=[path("wlan0", "cloud-a", lost=100)])
-    assert "10 % lost" in texts(running_checks.paths(lossy, {}), Level.WARN)[0]
+    lossy = state(paths=[losing("wlan0", "cloud-a")])
+    assert "10 % of 500 datagrams lost in the last 50 s" in texts(running_checks.paths(lossy, {}), Level.WARN)[0]
     unstable = state(paths=[path("wlan0", "cloud-a", "unstable")])
     assert "unstable" in texts(running_checks.paths(unstable, {}), Level.WARN)[0]
 
@@ -165,6 +170,20 @@ def test_stun_that_is_not_answered_is_warned_of_unless_the_other_family_is() -> 
     both = state(interfaces=[interface("wlan0", stun=[stun(), {**silent, "family": 6}])])
     assert texts(running_checks.stun(both), *BAD) == []
     assert len(texts(running_checks.stun(state(interfaces=[interface("wlan0", stun=[])])), Level.WARN)) == 1
+
+
+@pytest.mark.parametrize(
+    ("servers", "expected"),
+    [
+        (["cp.example:3479", "[2001:db8::1]:3478"], "check 3479/udp of cp.example, 3478/udp of [2001:db8::1], a route"),
+        ([f"stun-{number}:9000" for number in range(5)], "9000/udp of stun-2 and of 2 more, a route"),
+        ([], "check the UDP port of the STUN servers, a route"),
+    ],
+)
+def test_a_silent_stun_server_is_named_with_its_own_port(servers: list[str], expected: str) -> None:
+    silent = interface("wlan0", stun=[stun(mapping=None, answered_s=None, problem="no answer")])
+    told = state(interfaces=[silent], node={**state()["node"], "stun_servers": servers})
+    assert expected in next(running_checks.stun(told)).remedy
 
 
 def test_a_path_that_carries_the_least_only_is_warned_of() -> None:
