@@ -121,6 +121,12 @@ class _Control(_Entry):
     retry_in_s: float | None = None
 
 
+class _Conflict(_Entry):
+    service: Text
+    server: Text
+    type: Text
+
+
 class _Services(_Entry):
     carried: dict[Text, Text] = {}
     left_alone: dict[Text, list[Text]] = {}
@@ -130,6 +136,7 @@ class _Services(_Entry):
     silent: list[Text] = []
     unreached: dict[Text, Whole] = {}
     configured: list[Text] = []
+    conflicts: list[_Conflict] = []
 
 
 class _Mapping(_Entry):
@@ -149,6 +156,11 @@ class _Mapped(_Entry):
     predicted_miss: float | None = None
     reason: Text = ""
     deadline_s: float | None = None
+
+
+class _Ways(_Entry):
+    service: Text
+    paths: list[_Pair]
 
 
 class _RefusedPeer(_Entry):
@@ -210,6 +222,7 @@ _KINDS: dict[str, Any] = {
     "services": _Services,
     "mapping": _Mapping,
     "mapped": list[_Mapped],
+    "ways": list[_Ways],
     "refused_peers": list[_RefusedPeer],
     "gone": list[_Gone],
     "paths": list[_Path],

@@ -14,9 +14,11 @@ from dataclasses import dataclass
 from itertools import islice
 from typing import TYPE_CHECKING, Any
 
+from plr.protos.model.ids import Role
 from plr.protos.program.certificate_term import term_problem
 from plr.sidecar.core.base.values import PathState
 from plr.sidecar.local.protocol import VERSION
+from plr.sidecar.local.ways import ways
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Mapping
@@ -27,6 +29,7 @@ if TYPE_CHECKING:
     from plr.sidecar.config.sidecar import SidecarConfig
     from plr.sidecar.control.client import ControlView
     from plr.sidecar.core.base.values import PathId
+    from plr.sidecar.core.robot.robot_role import Destinations
     from plr.sidecar.net.dataplane import ThreadedDataPlane
     from plr.sidecar.net.interface_manager import InterfaceView
     from plr.sidecar.ros.stats import BridgeStats
@@ -35,6 +38,8 @@ PATHS_A_PART = 16
 SERVICES_A_PART = 16
 GONE_S, MAX_GONE = 3600.0, 64
 """Time for which paths to nodes that are no longer peers are reported, and most of them."""
+MAX_CONFLICTS = 64
+"""Most servers of another type shown."""
 MAX_REFUSED_PEERS = 64
 """Most refused peers shown."""
 ENVIRONMENT = (
@@ -92,7 +97,8 @@ class LocalState:
         yield "idle", [name for name, carries in self.idle().items() if not carries]
         yield "unopened", dict(self.unopened())
         yield "control", self._control(now)
-        yield from self._services(now)
+        destinations = self.data_plane.destinations() if self.config.role is Role.ROBOT else None
+        yield from self._services(now, destinations)
         refused = self.data_plane.peer_trust.refused(MAX_REFUSED_PEERS)
         yield "refused_peers", [{"name": name, "why": why} for name, why in refused]
         gone = self.data_plane.gone_paths(now - GONE_S, MAX_GONE)
@@ -167,7 +173,7 @@ class LocalState:
             "retry_in_s": None if view.connected else max(0.0, min(view.retry_at - now, 3600.0)),
         }
 
-    def _services(self, now: float) -> Iterator[tuple[str, Any]]:
+    def _services(self, now: float, destinations: Destinations | None) -> Iterator[tuple[str, Any]]:
         bridge = self.bridge()
         offers, uses = self.data_plane.services()
         types = {offer.name: offer.type for offer in offers} | {use.name: use.type for use in uses}
@@ -182,6 +188,10 @@ class LocalState:
                 "silent": sorted(bridge.silent),
                 "unreached": dict(self.unreached()),
                 "configured": [service.name for service in self.config.services],
+                "conflicts": [
+                    {"service": service, "server": server, "type": kind}
+                    for service, server, kind in sorted(() if destinations is None else destinations.conflicts)
+                ][:MAX_CONFLICTS],
             },
         )
         origin = self.origin()
@@ -208,6 +218,21 @@ class LocalState:
                         "deadline_s": deadlines.get(one.service),
                     }
                     for one in part
+                ],
+            )
+
+        if destinations is None:
+            return
+        found = ways(destinations, mapped, (view for view, _ in self.data_plane.path_views(now)))
+        while some := list(islice(found, SERVICES_A_PART)):
+            yield (
+                "ways",
+                [
+                    {
+                        "service": one.service,
+                        "paths": [{"interface": path.interface, "server": path.peer} for path in one.paths],
+                    }
+                    for one in some
                 ],
             )
 

@@ -37,6 +37,7 @@ if TYPE_CHECKING:
     from plr.sidecar.core.message.decoding import Decoding
     from plr.sidecar.core.path.history import LivenessChange
     from plr.sidecar.core.path.view import PathView
+    from plr.sidecar.core.robot.robot_role import Destinations
     from plr.sidecar.core.seam.application import CarriedService
     from plr.sidecar.core.seam.links import LinkEvent
     from plr.sidecar.core.seam.stats import EngineStats, LinkStats
@@ -266,6 +267,11 @@ class ThreadedDataPlane:
             gone += [(path, last) for path, last in link.history.all().items() if path not in known]
         gone = [(path, last) for path, last in gone if last.state is PathState.DOWN and last.at > since]
         return sorted(gone, key=lambda one: -one[1].at)[:at_most]
+
+    def destinations(self) -> Destinations:
+        """Robot: return where new requests may go; the engine's lock is held to copy references only."""
+        with self._lock:
+            return self._engine.robot.destinations(self._clock())
 
     # -- what metrics and status read -----------------------------------------------------------------------------
 
