@@ -286,19 +286,24 @@ def _ros(where: Where, config: SidecarConfig | None, state: dict[str, Any] | Non
             if known
             else replace(one, text=f"{one.text} (the environment of this shell: no unit starts {where.config})")
         )
-    if config is not None:
-        wanted = _types_last_offered(config)
+    if config is not None and (wanted := _types_wanted(config)):
+        if wrong is not None:
+            names = ", ".join(f"{name} ({kind})" for name, kind in sorted(wanted.items()))
+            yield warn("types", f"not checked, because ROS does not work here: {names}", "see ros above")
+            return
         yield from node_checks.types(wanted, {name: kind for name, kind in wanted.items() if not _is_installed(kind)})
 
 
-def _types_last_offered(config: SidecarConfig) -> dict[str, str]:
-    """Return the types of the configured services that the peers of the last run offered."""
+def _types_wanted(config: SidecarConfig) -> dict[str, str]:
+    """Return the types of the configured services: those of the configuration, and those last offered of the others."""
     last = _read_state(config.state_dir / LAST_GOOD_FILE, lambda data: decode_last_good(data, config.node_name))
-    if last is None or last.peers is None:
-        return {}
     rules = Rules(config.service_rules())
-    offers = [offer for peer in last.peers.peers for offer in peer.offers]
-    return {offer.name: offer.type for offer in offers if rules.find(offer.name) is not None}
+    offers = [offer for peer in last.peers.peers for offer in peer.offers] if last is not None and last.peers else []
+    wanted: dict[str, str] = {}
+    for offer in offers:
+        if (rule := rules.find(offer.name)) is not None:
+            wanted[offer.name] = rule.type or offer.type
+    return wanted | {rule.pattern: rule.type for rule in config.service_rules() if rule.type}
 
 
 def _is_installed(kind: str) -> bool:
