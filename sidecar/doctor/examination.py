@@ -16,7 +16,7 @@ from plr.protos.program.config_file import parse_yaml, read_text
 from plr.protos.program.regular_file import read_regular
 from plr.protos.program.tls_files import load_tls_files
 from plr.protos.trust.identity import Identity, IdentityRole
-from plr.sidecar.config.service_user import unreadable
+from plr.sidecar.config.service_user import unreadable, unreadable_program
 from plr.sidecar.config.sidecar import load_config
 from plr.sidecar.core.rules.service_rule import Rules
 from plr.sidecar.doctor import host, node_checks, running_checks
@@ -170,6 +170,8 @@ def examine(where: Where, *, pinging: bool = True) -> Examination:
     if config is not None and seen.state is None and (found := unreadable(where.config, config.tls_dir)) is not None:
         # A running sidecar says itself which files it cannot read.
         seen.findings.append(warn("certificate", found.text, found.remedy))
+    if seen.state is None and (found := unreadable_program(where.config)) is not None:
+        seen.findings.append(fail("sidecar", found.text, found.remedy))
     seen.findings += _ros(where, config, seen.state)
     seen.findings += _interfaces(config, seen.state)
     if seen.state is not None and client is not None:
