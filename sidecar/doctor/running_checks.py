@@ -385,7 +385,9 @@ def services(state: State) -> Iterator[Finding]:
     level = fail if useless else warn
     odd = _by(told.get("conflicts") or (), lambda one: one["service"])
     for name in told.get("unmet") or ():
-        if name not in odd:
+        if robot and not state["paths"]:
+            yield level("service", f"{name}: configured, but no cloud server is known", "see path above")
+        elif name not in odd:
             yield level("service", f"{name}: configured, but not offered by {who}", remedy)
     for name, ones in sorted(odd.items()):
         kinds = ", ".join(f"{one['server']} offers it as {one['type']}" for one in ones[:MAX_SHOWN_CONFLICTS])

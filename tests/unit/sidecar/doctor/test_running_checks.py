@@ -265,6 +265,7 @@ def test_a_robot_without_a_single_service_fails_and_says_why(told: dict[str, Any
     assert texts(running_checks.services(state(services=one_left)), Level.FAIL) == []
     alone = texts(running_checks.services(state(services=told, paths=[])), Level.FAIL)
     assert alone[-1] == "none is offered, because no peer is known"
+    assert not any("control plane names" in text for text in alone)
 
 
 def test_a_cloud_that_offers_nothing_is_warned_only() -> None:
