@@ -28,7 +28,7 @@ with extras.required("plr-sidecar", "sidecar"):
     from plr.protos.program.logging_setup import Logging
     from plr.protos.program.tls_files import load_tls_files
     from plr.protos.program.version_option import ShowVersion
-    from plr.sidecar.config.service_user import unreadable
+    from plr.sidecar.config.service_user import unreadable, unreadable_program
     from plr.sidecar.config.sidecar import SidecarConfig, config_schema, load_config, refuse_exposed
     from plr.sidecar.ros import environment, static_peers
     from plr.sidecar.stop_request import StopRequest
@@ -175,8 +175,9 @@ def _check_certificate(config: SidecarConfig) -> None:
 
 
 def _warn_of_unreadable_files(path: Path, config: SidecarConfig) -> None:
-    found = unreadable(path, config.tls_dir)
-    if found is not None:
+    for found in (unreadable(path, config.tls_dir), unreadable_program(path)):
+        if found is None:
+            continue
         sys.stderr.write(f"{PROGRAM}: warning: {escaped(f'{found.text}; do: {found.remedy}')}\n")
 
 

@@ -259,6 +259,7 @@ class SidecarRuntime:
             data_plane=self._data_plane,
             interfaces=self._interfaces.views,
             idle=self._interfaces.in_use,
+            stun_servers=lambda: self._interfaces.stun_servers,
             unopened=self._interfaces.unopened,
             control=self._control.view,
             bridge=lambda: self._bridge.stats,
@@ -360,7 +361,8 @@ class SidecarRuntime:
     def _log_changes(self, mapping: MappingSet) -> None:
         for service in mapping.services:
             if self._logged_mappings.get(service.service) != service.assignments:
-                pairs = ", ".join(f"{pair.interface} to {pair.server}" for pair in service.assignments) or "no path"
+                pairs = ", ".join(f"{pair.interface} to {pair.server}" for pair in service.assignments)
+                pairs = pairs or "the live paths with the shortest round trips, as it names none"
                 log.info("mapping %d: %s goes over %s: %s", mapping.version, service.service, pairs, service.reason)
         self._logged_mappings = {service.service: service.assignments for service in mapping.services}
 

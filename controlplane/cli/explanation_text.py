@@ -18,6 +18,9 @@ if TYPE_CHECKING:
 LEAST_SHOWN = 1e-9
 """Smallest probability worth showing: with less it would take years to see one miss."""
 
+MAX_LIVE = 8
+"""Live paths named of a service without a mapping."""
+
 LITTLE_GAIN = 0.5
 """If the other interface misses at least this share of what the better one misses, it gains little."""
 
@@ -60,18 +63,34 @@ def render(explanation: Explanation) -> str:
 def _mapping(found: Explanation) -> Iterator[str]:
     if found.mapping is None:
         yield "none has been sent yet"
+        yield _without_mapping(found)
         return
-    yield _paths(found.mapping.assignments)
-    observed = f", recently observed {_probability(found.observed_miss)}" if found.observed_miss is not None else ""
-    cost = f", a request costs {found.cost_per_request:g}" if found.cost_per_request is not None else ""
-    predicted = found.mapping.predicted_miss if found.predicted_miss is None else found.predicted_miss
-    yield f"predicted miss {_probability(predicted)}{observed}{cost}"
+    observed = f"recently observed {_probability(found.observed_miss)}" if found.observed_miss is not None else ""
+    if found.mapping.assignments:
+        yield _paths(found.mapping.assignments)
+        cost = f"a request costs {found.cost_per_request:g}" if found.cost_per_request is not None else ""
+        predicted = found.mapping.predicted_miss if found.predicted_miss is None else found.predicted_miss
+        misses = [f"predicted miss {_probability(predicted)}", observed, cost]
+    else:
+        yield "it names no path"  # and so predicts nothing
+        yield _without_mapping(found)
+        misses = [f"miss {observed}" if observed else ""]
+    if any(misses):
+        yield ", ".join(filter(None, misses))
     age = f", in use for {_age(found.in_force_s)}" if found.in_force_s is not None else ""
     refused = f" ({found.sync.error})" if found.sync.error else ""
     yield f"version {found.sync.version_sent}, {found.sync.state.value}{refused}{age}"
     yield f"reason: {found.mapping.reason or '-'}"
     if found.mapping.explore is not None:
         yield f"explores {_path(found.mapping.explore)}: a few requests send one more copy there"
+
+
+def _without_mapping(found: Explanation) -> str:
+    """Return what a robot does for which the control plane has chosen no path."""
+    live = [_path(pair.path) for pair in found.pairs if pair.up]
+    more = f" and {len(live) - MAX_LIVE} more" if len(live) > MAX_LIVE else ""
+    over = f"; it last reported these up: {', '.join(live[:MAX_LIVE])}{more}" if live else ""
+    return f"meanwhile the robot itself chooses live paths to the servers of it that it knows, the fastest first{over}"
 
 
 def _pairs(found: Explanation) -> Iterator[str]:

@@ -93,7 +93,7 @@ def _details(status: SidecarStatus) -> Iterator[tuple[str, bool]]:
     if status.refused_offers:
         yield f"REFUSED by the policy: {', '.join(status.refused_offers)} (offered here, announced to no robot)", True
     for mapping in status.services:
-        yield _mapping(mapping), not mapping.assignments
+        yield _mapping(mapping, status.paths), not mapping.assignments
     for use in status.uses:
         if use.fallback_up is not None:
             state = "ready on the robot" if use.fallback_up else "MISSING: its node does not run, or has another type"
@@ -170,9 +170,13 @@ def _rejection(resource: ResourceStatus) -> str:
     return f"REJECTED version {resource.version_sent}, {kept}: {resource.error}"
 
 
-def _mapping(mapping: ServiceMapping) -> str:
+def _mapping(mapping: ServiceMapping, paths: Iterable[PathReport]) -> str:
+    if not mapping.assignments:
+        live = ", ".join(f"{path.interface} -> {path.server}" for path in paths if path.up)
+        then = f"if the robot knows a server of it, requests go over what is up: {live}" if live else "no path is up"
+        return f"{mapping.service}: no mapping ({mapping.reason}); {then}"
     pairs = ", ".join(f"{assignment.interface} -> {assignment.server}" for assignment in mapping.assignments)
-    return f"{mapping.service}: {pairs or 'nowhere'} (predicted miss {mapping.predicted_miss:.3g}; {mapping.reason})"
+    return f"{mapping.service}: {pairs} (predicted miss {mapping.predicted_miss:.3g}; {mapping.reason})"
 
 
 def _path(path: PathReport) -> tuple[str, ...]:

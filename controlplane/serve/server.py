@@ -7,7 +7,6 @@ import contextlib
 import logging
 import os
 import socket
-import tempfile
 import time
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
@@ -22,6 +21,7 @@ from plr.controlplane.observe.metrics import Metrics
 from plr.controlplane.serve import admin, service
 from plr.controlplane.serve.access import AccessGuard
 from plr.controlplane.serve.certificate_watch import CertificateKeeper
+from plr.controlplane.serve.socket_folder import socket_folder, socket_path
 from plr.controlplane.serve.stream_limits import MAX_STREAM_MESSAGE_BYTES, MAX_STREAMS_PER_CONNECTION
 from plr.controlplane.serve.stun_server import start_stun_server
 from plr.controlplane.serve.tls_gate import TlsGate
@@ -107,8 +107,8 @@ async def serve(
         cleanup.callback(events.close)
         loop = ControlLoop(config, metrics, events)
         # Nobody but this user can reach the socket behind the gate.
-        folder = cleanup.enter_context(tempfile.TemporaryDirectory(prefix="plr-controlplane-"))
-        upstreams = [f"{folder}/grpc-{number}" for number in range(SERVERS)]
+        folder = cleanup.enter_context(socket_folder())
+        upstreams = [socket_path(folder, number) for number in range(SERVERS)]
         clock = ClockFloor(time.time, alert=log.error)
         gate = TlsGate(files, upstreams, metrics.refused_connection, clock) if files is not None else None
         if gate is not None:

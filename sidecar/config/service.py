@@ -122,7 +122,7 @@ class ServiceConfig(Section):
     before a glob that matches it."""
     type: Annotated[ServiceType | None, _ROBOT] = None
     """Type of the service, such as `nav_msgs/srv/GetPlan`. Servers that offer the service with another type get no
-    requests. Without this key, the type that most servers offer applies."""
+    requests. The type must be installed on the robot. Without this key, the type that most servers offer applies."""
     deadline_ms: Annotated[float | None, Field(gt=0, le=MAX_DEADLINE_MS), _ROBOT] = None
     """Required. An answer is in time if it arrives within this many milliseconds. The request does not end at the
     deadline."""

@@ -7,8 +7,11 @@ from __future__ import annotations
 
 import os
 import pwd
+import shlex
 import stat
+import sys
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from plr.protos.program.tls_files import CA_FILE, CERTIFICATE_FILE, CRL_FILE, KEY_FILE
@@ -16,10 +19,17 @@ from plr.sidecar.config.unit import installed
 
 if TYPE_CHECKING:
     from collections.abc import Container, Iterable
-    from pathlib import Path
+
+    from plr.sidecar.config.unit import Unit
 
 ACCOUNT = "plr"
 """The user of the shipped unit."""
+PREFIX = Path("/opt/plr")
+"""Where the pages install the program."""
+MAX_PACKAGES = 1024
+"""Entries of its site-packages that are looked at."""
+MAX_SHOWN = 3
+"""Unreadable paths that are named."""
 _ACL = "system.posix_acl_access"
 
 
@@ -58,6 +68,50 @@ def _judge(name: str, files: Iterable[Path], tls_dir: Path | None, blocked: list
         commands = [] if folder is None else [f"chown -R {name} {folder}"]
         return Unreadable(text, " && ".join(commands + [f"chown {name} {one}" for one in rest]))
     return Unreadable(text, "move the files to a folder that it may enter, such as /etc/plr/tls")
+
+
+def unreadable_program(config: Path) -> Unreadable | None:
+    """Return what of the installed program the service's account may not read, if this is root.
+
+    An installation with umask 077 leaves such files: root runs the program, and the service does not start.
+    """
+    if os.geteuid() != 0:
+        return None
+    unit = installed(config)
+    program = _program(unit)
+    if program is None:
+        return None
+    prefix = program.parent.parent
+    packages = sorted(prefix.glob("lib/python3*/site-packages/*"))[:MAX_PACKAGES]
+    files = [program, program.with_name("python"), prefix / "pyvenv.cfg"]
+    files += [path / "__init__.py" if (path / "__init__.py").exists() else path for path in packages]
+    profile = (unit.environment if unit is not None else {}).get("FASTRTPS_DEFAULT_PROFILES_FILE")
+    files += [Path(profile)] if profile else []
+    try:
+        account = pwd.getpwnam(ACCOUNT if unit is None else unit.user)
+    except KeyError:
+        return None
+    blocked = blocking(files, account.pw_uid, frozenset(os.getgrouplist(account.pw_name, account.pw_gid)))
+    if not blocked:
+        return None
+    shown = ", ".join(map(str, blocked[:MAX_SHOWN]))
+    shown += f" and {len(blocked) - MAX_SHOWN} more" if len(blocked) > MAX_SHOWN else ""
+    ours = [path for path in blocked if path == prefix or prefix in path.parents]
+    others = [f"chmod a+rX {path}" for path in blocked if path not in ours]
+    return Unreadable(
+        f"the account {account.pw_name}, which runs the service, may not read {shown}, as after an installation with "
+        "umask 077: the service does not start",
+        " && ".join([f"chmod -R a+rX {prefix}"] * bool(ours) + others),
+    )
+
+
+def _program(unit: Unit | None) -> Path | None:
+    """Return the program that the unit starts; without a unit, this one, if it is installed where the pages say."""
+    if unit is None:
+        return PREFIX / "bin" / "plr-sidecar" if Path(sys.prefix) == PREFIX else None
+    words = shlex.split(unit.command)
+    program = Path(words[0].lstrip("-@:+!")) if words else Path()
+    return program if program.is_absolute() else None
 
 
 def blocking(files: Iterable[Path], user: int, groups: Container[int]) -> list[Path]:

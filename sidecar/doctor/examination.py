@@ -16,7 +16,7 @@ from plr.protos.program.config_file import parse_yaml, read_text
 from plr.protos.program.regular_file import read_regular
 from plr.protos.program.tls_files import load_tls_files
 from plr.protos.trust.identity import Identity, IdentityRole
-from plr.sidecar.config.service_user import unreadable
+from plr.sidecar.config.service_user import unreadable, unreadable_program
 from plr.sidecar.config.sidecar import load_config
 from plr.sidecar.core.rules.service_rule import Rules
 from plr.sidecar.doctor import host, node_checks, removed_peers, running_checks
@@ -170,6 +170,8 @@ def examine(where: Where, *, pinging: bool = True) -> Examination:
     if config is not None and seen.state is None and (found := unreadable(where.config, config.tls_dir)) is not None:
         # A running sidecar says itself which files it cannot read.
         seen.findings.append(warn("certificate", found.text, found.remedy))
+    if seen.state is None and (found := unreadable_program(where.config)) is not None:
+        seen.findings.append(fail("sidecar", found.text, found.remedy))
     seen.findings += _ros(where, config, seen.state)
     seen.findings += _interfaces(config, seen.state)
     if seen.state is not None and client is not None:
@@ -286,19 +288,24 @@ def _ros(where: Where, config: SidecarConfig | None, state: dict[str, Any] | Non
             if known
             else replace(one, text=f"{one.text} (the environment of this shell: no unit starts {where.config})")
         )
-    if config is not None:
-        wanted = _types_last_offered(config)
+    if config is not None and (wanted := _types_wanted(config)):
+        if wrong is not None:
+            names = ", ".join(f"{name} ({kind})" for name, kind in sorted(wanted.items()))
+            yield warn("types", f"not checked, because ROS does not work here: {names}", "see ros above")
+            return
         yield from node_checks.types(wanted, {name: kind for name, kind in wanted.items() if not _is_installed(kind)})
 
 
-def _types_last_offered(config: SidecarConfig) -> dict[str, str]:
-    """Return the types of the configured services that the peers of the last run offered."""
+def _types_wanted(config: SidecarConfig) -> dict[str, str]:
+    """Return the types of the configured services: those of the configuration, and those last offered of the others."""
     last = _read_state(config.state_dir / LAST_GOOD_FILE, lambda data: decode_last_good(data, config.node_name))
-    if last is None or last.peers is None:
-        return {}
     rules = Rules(config.service_rules())
-    offers = [offer for peer in last.peers.peers for offer in peer.offers]
-    return {offer.name: offer.type for offer in offers if rules.find(offer.name) is not None}
+    offers = [offer for peer in last.peers.peers for offer in peer.offers] if last is not None and last.peers else []
+    wanted: dict[str, str] = {}
+    for offer in offers:
+        if (rule := rules.find(offer.name)) is not None:
+            wanted[offer.name] = rule.type or offer.type
+    return wanted | {rule.pattern: rule.type for rule in config.service_rules() if rule.type}
 
 
 def _is_installed(kind: str) -> bool:

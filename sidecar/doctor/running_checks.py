@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 from plr.sidecar.core.path.pmtu import HEADERS_V4, HEADERS_V6, LEAST_MTU
 from plr.sidecar.core.wire.frame import BASE_BYTES
+from plr.sidecar.doctor import losses
 from plr.sidecar.doctor.finding import duration, fail, milliseconds, ok, share, warn
 
 if TYPE_CHECKING:
@@ -30,10 +31,12 @@ STARTED_S = 20.0
 """Peers are known and probed within this time after the start."""
 MAX_SHOWN_GONE = 8
 """Lines about nodes that are no longer peers."""
+MAX_SHOWN_CONFLICTS = 3
+"""Servers named that offer a service with another type."""
+MAX_SHOWN_STUN = 3
+"""STUN servers named in a remedy."""
 GOODBYE = "peer closed"
 """Reason for a path going down when its node ended in order."""
-LOSSY = 0.05
-"""Loss rate of datagrams above which a path gets a warning."""
 HOPELESS = 0.5
 """Predicted misses above which a service without a target gets a warning."""
 SHARED_ADDRESSES = ip_network("100.64.0.0/10")
@@ -103,7 +106,7 @@ def stun(state: State) -> Iterator[Finding]:
             if answered:
                 yield ok("stun", f"{what} ({why}): harmless, because the other family gets answers")
             else:
-                remedy = "3478/udp of the control plane, a route over this interface, rp_filter"
+                remedy = f"{_stun_ports(state)}, a route over this interface, rp_filter"
                 yield warn("stun", f"{what}: {why}", f"check {remedy}: docs/operate/troubleshooting.md, STUN fails")
         if interface["stun"]:
             continue
@@ -118,6 +121,15 @@ def stun(state: State) -> Iterator[Finding]:
             yield warn(
                 "stun", f"{interface['name']}: no STUN server is known", "check that the control plane's name resolves"
             )
+
+
+def _stun_ports(state: State) -> str:
+    """Return which ports have to be open: those of the servers that the sidecar asks."""
+    servers = (state.get("node") or {}).get("stun_servers")
+    if not servers:  # an earlier version does not report them
+        return "the UDP port of the STUN servers"
+    shown = [f"{port}/udp of {host}" for host, port in (server.rsplit(":", 1) for server in servers[:MAX_SHOWN_STUN])]
+    return ", ".join(shown) + (f" and of {len(servers) - MAX_SHOWN_STUN} more" if len(servers) > MAX_SHOWN_STUN else "")
 
 
 def _is_fresh(one: Mapping[str, Any]) -> bool:
@@ -206,13 +218,9 @@ def paths(state: State, pings: Mapping[PathKey, Pinged]) -> Iterator[Finding]:
     dark_interfaces = {name for name, ones in by_interface.items() if all(_is_down(one) for one in ones)}
     dark_peers = {name for name, ones in by_peer.items() if all(_is_down(one) for one in ones)}
     if not by_peer:
-        yield warn(
-            "path",
-            "no peer is known",
-            "check that the control plane is reached and that the policy names peers: plr status",
-        )
+        yield _no_peer(state)
         return
-    if len(dark_peers) == len(by_peer) and (state.get("node") or {}).get("up_s", STARTED_S) < STARTED_S:
+    if len(dark_peers) == len(by_peer) and _just_started(state):
         yield warn("path", "no peer is reached yet: the sidecar has just started", "try again in a moment")
     elif len(dark_peers) == len(by_peer):
         yield fail(
@@ -234,13 +242,49 @@ def paths(state: State, pings: Mapping[PathKey, Pinged]) -> Iterator[Finding]:
                 f"{name}: not reached over {_over(ones or by_peer[name])}, but others are: {_why(by_peer[name])}",
                 f"check that the host of {name} is up, its sidecar runs and its UDP port is open",
             )
-    told = {(path["interface"], path["peer"]) for path in state["paths"] if not _is_down(path)}
-    for path in sorted(state["paths"], key=lambda one: (one["peer"], one["interface"], one["remote"])):
+    ones = sorted(state["paths"], key=lambda one: (one["peer"], one["interface"], one["remote"]))
+    blame = losses.blame(ones)
+    yield from blame.findings
+    told = {(path["interface"], path["peer"]) for path in ones if not _is_down(path)}
+    for number, path in enumerate(ones):
         blamed = path["interface"] in dark_interfaces or path["peer"] in dark_peers
         # It is normal that a further interface of a peer (IPv6-only, an inner network) is not reached from here.
         if _is_down(path) and (blamed or (path["interface"], path["peer"]) in told):
             continue
-        yield _path(path, pings.get((path["interface"], path["peer"], path["remote"])))
+        pinged = pings.get((path["interface"], path["peer"], path["remote"]))
+        yield _path(path, pinged, blame.explained.get(number))
+
+
+def _just_started(state: State) -> bool:
+    return bool((state.get("node") or {}).get("up_s", STARTED_S) < STARTED_S)
+
+
+def _is_robot(state: State) -> bool:
+    return (state.get("node") or {}).get("role") == "robot"
+
+
+def _no_peer(state: State) -> Finding:
+    """Say why no peer is known. A robot cannot do its job then; a cloud waits for robots."""
+    level = fail if _is_robot(state) and not _just_started(state) else warn
+    told = state.get("control") or {}
+    others = "cloud server" if _is_robot(state) else "robot"
+    if not told.get("connected"):
+        why = told.get("last_failure") or "not connected yet"
+        names = ", ".join(told.get("names") or ())
+        return level(
+            "path",
+            f"no peer is known: the control plane {names} is not reached ({why}), and no peer is known from before",
+            "see control below: docs/operate/troubleshooting.md, The control plane is out of reach",
+        )
+    if state.get("refused_peers"):
+        return level("path", "no peer is accepted: all that the control plane names are refused", "see peer above")
+    return level(
+        "path",
+        f"no peer is known: the control plane names no {others} to this node; none is registered, or the policy lets "
+        "this node use none",
+        f"on the operator's host: plr status shows whether a {others} is registered, and plr events when one left; for "
+        "the policy see docs/use/access-control.md",
+    )
 
 
 def gone(state: State) -> Iterator[Finding]:
@@ -264,7 +308,8 @@ def gone(state: State) -> Iterator[Finding]:
         yield ok("peer", f"{len(left) - MAX_SHOWN_GONE} more nodes were peers within the last hour")
 
 
-def _path(path: Mapping[str, Any], pinged: Pinged | None) -> Finding:
+def _path(path: Mapping[str, Any], pinged: Pinged | None, blamed: str | None) -> Finding:
+    """Judge one path; `blamed` is what its losses are blamed on, if not on itself."""
     where = "" if path["address"] is None else f" ({_shown(*path['address'])})"
     since = "" if path["since_s"] is None else f" for {duration(path['since_s'])}"
     name = f"{path['interface']} to {path['peer']}{where}"
@@ -272,9 +317,8 @@ def _path(path: Mapping[str, Any], pinged: Pinged | None) -> Finding:
         why = f", {path['reason']}" if path["reason"] else ""
         remedy = f"ping -I {path['interface']} {path['address'][0] if path['address'] else path['peer']}"
         return warn("path", f"{name}: down{since}{why}", f"{remedy}; docs/operate/troubleshooting.md, A path is down")
-    lost = path["lost"] / path["sent"] if path["sent"] else 0.0
     measured = f"round trip {milliseconds(path['rtt_s'])}" if path["rtt_s"] else "round trip unknown"
-    text = f"{name}: {path['state']}{since}, {measured}, {share(lost)} lost"
+    text = f"{name}: {path['state']}{since}, {measured}, {losses.told(path)}"
     if path["rests"]:
         text += f", at rest (last heard {duration(path['proven_s'])} ago)"
     if pinged is not None and pinged.sent <= 0 and pinged.problem:
@@ -287,8 +331,10 @@ def _path(path: Mapping[str, Any], pinged: Pinged | None) -> Finding:
         text += f"; ping {fastest} to {slowest}, {pinged.sent - len(pinged.rtts_s)} of {pinged.sent} lost"
     if path["state"] != "up":
         return warn("path", text, f"the path may be about to go down: plr ping {path['peer']} -I {path['interface']}")
-    if lost > LOSSY and path["sent"] >= 100:
-        return warn("path", text, "check the carrier: the signal may be weak, or a queue full")
+    if losses.is_lossy(path):
+        if blamed is not None:
+            return ok("path", f"{text}: see {blamed} above")
+        return warn("path", text, f"check the carrier: the signal may be weak, or a queue full; {losses.SEE}")
     return ok("path", text)
 
 
@@ -324,13 +370,32 @@ def services(state: State) -> Iterator[Finding]:
     """Judge the services that are carried."""
     told = state.get("services") or {}
     node = state.get("node") or {}
-    robot = node.get("role") == "robot"
+    robot = _is_robot(state)
     if robot:
-        who, remedy = "a server that this robot knows", "compare the names: plr status"
+        who = "any cloud server that the control plane names to this robot"
+        remedy = (
+            "on the operator's host: plr status shows what the servers offer (compare the names), and plr explain "
+            f"{node.get('name') or 'ROBOT'} SERVICE whether the policy denies it"
+        )
     else:
         who, remedy = _domain(node)
+    carried = told.get("carried") or {}
+    # A robot without a single service cannot do its job; one that has just started may have them in a moment.
+    useless = robot and not carried and not told.get("left_alone") and not _just_started(state)
+    level = fail if useless else warn
+    odd = _by(told.get("conflicts") or (), lambda one: one["service"])
     for name in told.get("unmet") or ():
-        yield warn("service", f"{name}: configured, but not offered by {who}", remedy)
+        if robot and not state["paths"]:
+            yield level("service", f"{name}: configured, but no cloud server is known", "see path above")
+        elif name not in odd:
+            yield level("service", f"{name}: configured, but not offered by {who}", remedy)
+    for name, ones in sorted(odd.items()):
+        kinds = ", ".join(f"{one['server']} offers it as {one['type']}" for one in ones[:MAX_SHOWN_CONFLICTS])
+        yield (level if name in (told.get("unmet") or ()) else warn)(
+            "service",
+            f"{name}: {kinds}, unlike the configuration or the other servers, so it gets no requests there",
+            "let all servers offer it with one type, and correct the key type of the service if it is set",
+        )
     for name in told.get("mismatched") or ():
         text = f"{name}: served by a node of this host's ROS domain, with an incompatible QoS"
         yield warn("service", text, "create the server with the default QoS of services, which is reliable")
@@ -339,17 +404,31 @@ def services(state: State) -> Iterator[Finding]:
         yield fail("service", text, "check whether that process hangs; if so, restart it")
     for name, servers in sorted((told.get("unreached") or {}).items()):
         text = f"{name}: offered by {servers} servers that this robot knows, but none of them is reached"
-        yield warn("service", text, "see path")
+        yield level("service", text, "see path")
     for name, nodes in sorted((told.get("left_alone") or {}).items()):
         text = f"{name}: served by {', '.join(nodes)} on this robot, so the sidecar does not offer it"
         yield warn("service", text, "stop that node, or rename its service")
-    carried = told.get("carried") or {}
     if carried:
         yield ok("service", f"offered {'here' if robot else 'to robots'}: {', '.join(sorted(carried))}")
     else:
-        yield warn(
-            "service", "none is offered", "docs/operate/troubleshooting.md, The service does not appear on the robot"
-        )
+        yield level("service", *_none_offered(state))
+
+
+def _none_offered(state: State) -> tuple[str, str]:
+    """Return why no service is offered here, and what to do."""
+    see = "docs/operate/troubleshooting.md, The service does not appear on the robot"
+    if not _is_robot(state):
+        return "none is offered", see
+    told = state.get("services") or {}
+    if not state["paths"]:
+        return "none is offered, because no peer is known", "see path above"
+    if told.get("unmet"):
+        return "none is offered: no server offers what is configured", f"see the lines above; {see}"
+    if told.get("unreached"):
+        return "none is offered: no server of a configured service is reached", "see path above"
+    if told.get("missing_types"):
+        return "none is offered: the types of all services are missing here", "see types above"
+    return "none is offered: no server that this robot knows offers a service that services names", see
 
 
 def _domain(node: Mapping[str, Any]) -> tuple[str, str]:
@@ -363,11 +442,12 @@ def _domain(node: Mapping[str, Any]) -> tuple[str, str]:
 
 def mapping(state: State, targets: Callable[[str], float | None]) -> Iterator[Finding]:
     """Judge a robot's mapping; `targets` returns the largest share of misses that a service may have."""
-    if (state.get("node") or {}).get("role") != "robot":
+    if not _is_robot(state):
         return
     told = state.get("mapping") or {}
+    carried = (state.get("services") or {}).get("carried") or {}
+    ways = {one["service"]: one["paths"] for one in state.get("ways") or ()}
     if not told.get("version"):
-        carried = bool((state.get("services") or {}).get("carried"))
         if carried:
             text, advice = (
                 "none: this robot chooses paths by round-trip time",
@@ -376,32 +456,79 @@ def mapping(state: State, targets: Callable[[str], float | None]) -> Iterator[Fi
         else:
             text, advice = "none: no service is offered yet", "see service"
         yield warn("mapping", text, advice)
-        return
-    where = f"version {told['version']} of the control plane, in force for {duration(told.get('age_s') or 0.0)}"
-    if told.get("source") == "disk":
+    elif told.get("source") == "disk":
         where = f"version {told['version']}, kept on disk by an earlier run"
         yield warn("mapping", f"{where}: the control plane has not sent a newer one", "see control below")
     else:
+        where = f"version {told['version']} of the control plane, in force for {duration(told.get('age_s') or 0.0)}"
         yield ok("mapping", where)
     down = {(one["interface"], one["peer"]) for one in state["paths"]}
     down -= {(one["interface"], one["peer"]) for one in state["paths"] if not _is_down(one)}
+    any_up = any(not _is_down(one) for one in state["paths"])
     for one in state["mapped"]:
-        pairs = ", ".join(f"{pair['interface']} to {pair['server']}" for pair in one["pairs"]) or "no path"
-        miss = one["predicted_miss"]
-        text = f"{one['service']} goes over {pairs}; predicted to miss {'unknown' if miss is None else share(miss)}"
-        target = targets(one["service"])
+        service = one["service"]
         dead = [pair for pair in one["pairs"] if (pair["interface"], pair["server"]) in down]
         if not one["pairs"]:
-            yield fail("mapping", text, "no server is reached that offers it: see path above, and plr status")
+            yield _unmapped(service, one.get("reason") or "", ways.get(service), any_up=any_up)
         elif dead:
-            names = ", ".join(f"{pair['interface']} to {pair['server']}" for pair in dead)
-            yield warn("mapping", f"{text}, but {names} is down: other paths are used", "see path above")
-        elif target is not None and miss is not None and miss > target:
-            yield warn("mapping", f"{text}, more than its target {share(target)}", "to see why: plr explain")
-        elif target is None and miss is not None and miss > HOPELESS:
-            yield warn("mapping", text, "to see why: plr explain")
+            yield _mapped_to_dead(one, dead, ways.get(service))
         else:
-            yield ok("mapping", text)
+            yield _mapped_to_live(one, targets(service))
+    for service in sorted(carried.keys() - {one["service"] for one in state["mapped"]}):
+        if service in ways:
+            yield _unmapped(service, "not sent yet", ways[service], any_up=any_up)
+
+
+def _unmapped(service: str, why: str, live: Sequence[Mapping[str, Any]] | None, *, any_up: bool) -> Finding:
+    """Judge a service for which the control plane names no path; `live` are the paths that it takes all the same.
+
+    `any_up`: whether any path to any peer is up.
+    """
+    text = f"{service}: no mapping from the control plane{f' ({why})' if why else ''}"
+    if live:
+        # Nothing predicts misses for these paths.
+        return warn(
+            "mapping",
+            f"{text}; requests go over these live paths: {_pairs(live)}",
+            "nothing, while requests are answered; for the reason see control below, and plr explain",
+        )
+    if live is None and any_up:  # an earlier version does not report them
+        return warn(
+            "mapping", f"{text}; requests go over live paths, if there are any to a server of it", "see path above"
+        )
+    return fail(
+        "mapping",
+        f"{text}, and no path to a server of it is up: requests go nowhere",
+        "no server is reached that offers it: see path above, plr status",
+    )
+
+
+def _mapped_to_dead(
+    one: Mapping[str, Any], dead: Sequence[Mapping[str, Any]], live: Sequence[Mapping[str, Any]] | None
+) -> Finding:
+    """Judge a service with mapped pairs that are down."""
+    text = f"{one['service']} goes over {_pairs(one['pairs'])}, but {_pairs(dead)} is down"
+    if live is None:  # an earlier version does not report them
+        return warn("mapping", f"{text}: other paths are used", "see path above")
+    if not live:
+        return fail("mapping", f"{text}, and no other path to a server of it is up", "see path above")
+    return warn("mapping", f"{text}; requests go over these live paths: {_pairs(live)}", "see path above")
+
+
+def _mapped_to_live(one: Mapping[str, Any], target: float | None) -> Finding:
+    """Judge a service whose mapped pairs are up; `target` is the largest share of misses that it may have."""
+    miss = one["predicted_miss"]
+    predicted = "unknown" if miss is None else share(miss)
+    text = f"{one['service']} goes over {_pairs(one['pairs'])}; predicted to miss {predicted}"
+    if target is not None and miss is not None and miss > target:
+        return warn("mapping", f"{text}, more than its target {share(target)}", "to see why: plr explain")
+    if target is None and miss is not None and miss > HOPELESS:
+        return warn("mapping", text, "to see why: plr explain")
+    return ok("mapping", text)
+
+
+def _pairs(pairs: Sequence[Mapping[str, Any]]) -> str:
+    return ", ".join(f"{pair['interface']} to {pair['server']}" for pair in pairs)
 
 
 def control(state: State) -> Iterator[Finding]:
@@ -415,8 +542,10 @@ def control(state: State) -> Iterator[Finding]:
         yield ok("control", f"{names} reached for {since}, over {over}{last}")
         return
     why = told.get("last_failure") or "not connected yet"
+    known = (state.get("mapping") or {}).get("version") or state["paths"]
+    then = "requests continue with what it sent before" if known else "nothing that it sent before is known"
     yield warn(
         "control",
-        f"{names} not reached for {since}: {why}; requests continue with the last mapping",
+        f"{names} not reached for {since}: {why}; {then}",
         "docs/operate/troubleshooting.md, The control plane is out of reach",
     )

@@ -52,6 +52,7 @@ class _Node(_Entry):
     up_s: float = 0.0
     insecure: bool = False
     stun: bool = True
+    stun_servers: list[Text] = []
     ros_problem: Text = ""
     left_out_peers: list[Text] = []
     environment: dict[Text, Text] = {}
@@ -120,6 +121,12 @@ class _Control(_Entry):
     retry_in_s: float | None = None
 
 
+class _Conflict(_Entry):
+    service: Text
+    server: Text
+    type: Text
+
+
 class _Services(_Entry):
     carried: dict[Text, Text] = {}
     left_alone: dict[Text, list[Text]] = {}
@@ -129,6 +136,7 @@ class _Services(_Entry):
     silent: list[Text] = []
     unreached: dict[Text, Whole] = {}
     configured: list[Text] = []
+    conflicts: list[_Conflict] = []
 
 
 class _Mapping(_Entry):
@@ -150,6 +158,11 @@ class _Mapped(_Entry):
     deadline_s: float | None = None
 
 
+class _Ways(_Entry):
+    service: Text
+    paths: list[_Pair]
+
+
 class _RefusedPeer(_Entry):
     name: Text
     why: Text
@@ -169,6 +182,12 @@ class _Gone(_Entry):
     reason: Text
 
 
+class _Recent(_Entry):
+    window_s: float
+    sent: Whole
+    lost: Whole
+
+
 class _Path(_Entry):
     interface: Text
     peer: Text
@@ -181,6 +200,7 @@ class _Path(_Entry):
     rtt_s: float | None = None
     sent: Whole = 0
     lost: Whole = 0
+    recent: _Recent | None = None
     max_datagram: Whole = 0
     proven_s: float = 0.0
     rests: bool = False
@@ -209,6 +229,7 @@ _KINDS: dict[str, Any] = {
     "services": _Services,
     "mapping": _Mapping,
     "mapped": list[_Mapped],
+    "ways": list[_Ways],
     "refused_peers": list[_RefusedPeer],
     "removed_peers": list[_RemovedPeer],
     "gone": list[_Gone],

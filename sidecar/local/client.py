@@ -34,7 +34,7 @@ MAX_STATE_BYTES = 8 << 20
 """Longest whole answer: some 20,000 paths."""
 ACCOUNT = "plr"
 """The systemd unit's user."""
-_REPEATED = frozenset({"paths", "interfaces", "mapped"})
+_REPEATED = frozenset({"paths", "interfaces", "mapped", "ways"})
 """Parts that come repeatedly."""
 _BUSY = "the sidecar is busy with others: try again"
 _STRANGER = "the program that answers at the socket is not a sidecar"

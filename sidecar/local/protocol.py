@@ -3,7 +3,7 @@
 {"id": 1, "ask": "state"}                                        the sidecar's state
 {"id": 2, "ask": "ping", "peer": "cloud-1", "interface": "wlan0", "size": 64}     a ping over each path to a peer
 
-{"id": 1, "part": "paths", "value": ...}      a piece of the answer; paths, interfaces and mapped come repeatedly
+{"id": 1, "part": "paths", "value": ...}      a piece of the answer; paths, interfaces, mapped and ways come repeatedly
 {"id": 2, "part": "pinged", "value": [...]}   the paths over which it is sent; then for each that is answered:
 {"id": 2, "part": "pong", "value": {"interface": ..., "remote": ..., "rtt_s": ..., "problem": ...}}
 {"id": 1, "end": true}                        the answer is complete

@@ -14,9 +14,11 @@ from dataclasses import dataclass
 from itertools import islice
 from typing import TYPE_CHECKING, Any
 
+from plr.protos.model.ids import Role
 from plr.protos.program.certificate_term import term_problem
 from plr.sidecar.core.base.values import PathState
 from plr.sidecar.local.protocol import VERSION
+from plr.sidecar.local.ways import ways
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Mapping
@@ -28,6 +30,7 @@ if TYPE_CHECKING:
     from plr.sidecar.control.client import ControlView
     from plr.sidecar.core.base.values import PathId
     from plr.sidecar.core.engine.engine import RemovedPeerView
+    from plr.sidecar.core.robot.robot_role import Destinations
     from plr.sidecar.net.dataplane import ThreadedDataPlane
     from plr.sidecar.net.interface_manager import InterfaceView
     from plr.sidecar.ros.stats import BridgeStats
@@ -37,6 +40,8 @@ SERVICES_A_PART = 16
 GONE_S, MAX_GONE = 3600.0, 64
 """Time for which paths to nodes that are no longer peers are reported, and most of them. The same holds for peers that
 the control plane removed, except that those that are still kept are reported for as long."""
+MAX_CONFLICTS = 64
+"""Most servers of another type shown."""
 MAX_REFUSED_PEERS = 64
 """Most refused peers shown."""
 ENVIRONMENT = (
@@ -67,6 +72,8 @@ class LocalState:
     interfaces: Callable[[], Iterable[InterfaceView]]
     idle: Callable[[], Mapping[InterfaceName, bool]]
     """Return the wanted interfaces, and whether each can carry something."""
+    stun_servers: Callable[[], tuple[str, ...]]
+    """Return the STUN servers in use, as host and port; empty before the first are known."""
     unopened: Callable[[], Mapping[InterfaceName, str]]
     """Return the interfaces whose sockets could not be opened, and why."""
     control: Callable[[], ControlView]
@@ -92,7 +99,8 @@ class LocalState:
         yield "idle", [name for name, carries in self.idle().items() if not carries]
         yield "unopened", dict(self.unopened())
         yield "control", self._control(now)
-        yield from self._services(now)
+        destinations = self.data_plane.destinations() if self.config.role is Role.ROBOT else None
+        yield from self._services(now, destinations)
         refused = self.data_plane.peer_trust.refused(MAX_REFUSED_PEERS)
         yield "refused_peers", [{"name": name, "why": why} for name, why in refused]
         yield "removed_peers", [_removed(one, now) for one in self.data_plane.removed_peers(now - GONE_S, MAX_GONE)]
@@ -132,6 +140,7 @@ class LocalState:
             "up_s": now - self.started_at,
             "insecure": config.insecure,
             "stun": config.stun.enabled,
+            "stun_servers": list(self.stun_servers()),
             "ros_problem": bridge.not_started,
             "left_out_peers": list(bridge.left_out_peers),
             "environment": {name: _told(os.environ[name]) for name in ENVIRONMENT if name in os.environ},
@@ -167,7 +176,7 @@ class LocalState:
             "retry_in_s": None if view.connected else max(0.0, min(view.retry_at - now, 3600.0)),
         }
 
-    def _services(self, now: float) -> Iterator[tuple[str, Any]]:
+    def _services(self, now: float, destinations: Destinations | None) -> Iterator[tuple[str, Any]]:
         bridge = self.bridge()
         offers, uses = self.data_plane.services()
         types = {offer.name: offer.type for offer in offers} | {use.name: use.type for use in uses}
@@ -182,6 +191,10 @@ class LocalState:
                 "silent": sorted(bridge.silent),
                 "unreached": dict(self.unreached()),
                 "configured": [service.name for service in self.config.services],
+                "conflicts": [
+                    {"service": service, "server": server, "type": kind}
+                    for service, server, kind in sorted(() if destinations is None else destinations.conflicts)
+                ][:MAX_CONFLICTS],
             },
         )
         origin = self.origin()
@@ -211,6 +224,21 @@ class LocalState:
                 ],
             )
 
+        if destinations is None:
+            return
+        found = ways(destinations, mapped, (view for view, _ in self.data_plane.path_views(now)))
+        while some := list(islice(found, SERVICES_A_PART)):
+            yield (
+                "ways",
+                [
+                    {
+                        "service": one.service,
+                        "paths": [{"interface": path.interface, "server": path.peer} for path in one.paths],
+                    }
+                    for one in some
+                ],
+            )
+
     def _paths(self, now: float) -> Iterator[tuple[str, Any]]:
         views = self.data_plane.path_views(now)
         while part := list(islice(views, PATHS_A_PART)):
@@ -229,6 +257,7 @@ class LocalState:
                         "rtt_s": view.smoothed_rtt_s,
                         "sent": view.sent,
                         "lost": max(0, view.lost - view.spurious),
+                        "recent": view.recent._asdict(),
                         "max_datagram": view.max_datagram,
                         "proven_s": max(0.0, now - view.proven_at),
                         "rests": view.state is PathState.UP and view.probe_every_s > 1.0,

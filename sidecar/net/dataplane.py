@@ -38,6 +38,7 @@ if TYPE_CHECKING:
     from plr.sidecar.core.message.decoding import Decoding
     from plr.sidecar.core.path.history import LivenessChange
     from plr.sidecar.core.path.view import PathView
+    from plr.sidecar.core.robot.robot_role import Destinations
     from plr.sidecar.core.seam.application import CarriedService
     from plr.sidecar.core.seam.links import LinkEvent
     from plr.sidecar.core.seam.stats import EngineStats, LinkStats
@@ -272,6 +273,11 @@ class ThreadedDataPlane:
         """Return the peers that the control plane removed after `since` (monotonic, s), and those that are kept."""
         with self._lock:
             return self._engine.removed_peers(since, at_most)
+
+    def destinations(self) -> Destinations:
+        """Robot: return where new requests may go; the engine's lock is held to copy references only."""
+        with self._lock:
+            return self._engine.robot.destinations(self._clock())
 
     # -- what metrics and status read -----------------------------------------------------------------------------
 

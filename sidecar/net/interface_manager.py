@@ -148,6 +148,11 @@ class InterfaceManager:
             self._stun_names = names
             self._resolver.look_up(names)
 
+    @property
+    def stun_servers(self) -> tuple[str, ...]:
+        """The STUN servers in use, as host:port; from any thread."""
+        return self._stun_names
+
     def in_use(self) -> dict[InterfaceName, bool]:
         """Return the interfaces that are wanted, and whether each can carry something; from any thread."""
         states = dict.fromkeys([*self._idle, *self._refused], False)

@@ -198,6 +198,23 @@ def test_a_type_that_is_not_installed_on_the_robot(mesh: Mesh, caplog: pytest.Lo
     assert any("install the ROS package 'nowhere_msgs'" in line for line in errors)
 
 
+@pytest.mark.usefixtures("often")
+def test_a_configured_type_that_is_not_installed_is_named_before_any_server_offers_it(
+    mesh: Mesh, caplog: pytest.LogCaptureFixture
+) -> None:
+    configured = {"/a": "nowhere_msgs/srv/Thing", "/good": PLAN_TYPE, "/maps/*": "nowhere_msgs/srv/Thing"}
+    mesh.use_rules(*(ServiceRule(name, deadline_s=0.1, lifetime_s=1.0, type=kind) for name, kind in configured.items()))
+    mesh.start()
+    wait_until(lambda: mesh.robot.stats.missing_types == {"/a": "nowhere_msgs/srv/Thing"}, "the missing type")
+    (line,) = [record.getMessage() for record in caplog.records if record.levelno >= logging.ERROR]
+    assert "install the ROS package 'nowhere_msgs'" in line
+    mesh.robot.handle(OfferService(ServiceName("/good"), PLAN_TYPE))
+    mesh.wait_carried("/good")
+    scans = mesh.robot.stats.scans
+    wait_until(lambda: mesh.robot.stats.scans > scans + 4, "more scans")
+    assert mesh.robot.stats.errors == {"type_not_installed": 1}
+
+
 def test_a_type_that_is_installed_later(
     mesh: Mesh, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:

@@ -28,8 +28,8 @@ def cloud(*offers: tuple[str, str]) -> Peer:
     return Peer(NodeName("cloud-1"), Role.CLOUD, SessionId(1), bytes(range(16)), 1, offers=told)
 
 
-def rule(pattern: str) -> ServiceRule:
-    return ServiceRule(pattern, deadline_s=0.1, lifetime_s=1.0)
+def rule(pattern: str, kind: str = "") -> ServiceRule:
+    return ServiceRule(pattern, deadline_s=0.1, lifetime_s=1.0, type=kind)
 
 
 def test_only_what_is_carried_and_lacks_its_type_is_named() -> None:
@@ -37,6 +37,18 @@ def test_only_what_is_carried_and_lacks_its_type_is_named() -> None:
     [line] = missing_types(peers, [rule("/plan"), rule("/where")])
     assert line.startswith(f"/plan, which cloud-1 offered last, cannot be carried: service type {ABSENT} is not inst")
     assert "nowhere_msgs" in line
+
+
+def test_the_type_that_the_configuration_names_needs_no_server() -> None:
+    rules = [rule("/plan", ABSENT), rule("/where", TRIGGER), rule("/maps/*", ABSENT)]
+    lines = missing_types([], rules)
+    assert [line.partition(" cannot be carried with the type that the configuration names: ")[0] for line in lines] == [
+        "/plan",
+        "/maps/*",
+    ]
+    assert all("install the ROS package 'nowhere_msgs'" in line for line in lines)
+    # Its servers are not blamed as well, nor for another type, which gets no requests.
+    assert missing_types([cloud(("/plan", ABSENT), ("/where", ABSENT))], rules) == lines
 
 
 def test_a_glob_does_not_fill_the_screen() -> None:

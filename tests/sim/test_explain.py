@@ -13,7 +13,7 @@ from plr.controlplane.core.policy.path_rules import PathRule
 from plr.controlplane.core.problem.problem import BlockKey
 from plr.protos.model.explanation import AlternativeKind, Correlation, Explanation
 from plr.protos.model.ids import InterfaceName, NodeName, Role, ServiceName
-from plr.protos.model.mapping import Assignment
+from plr.protos.model.mapping import Assignment, ServiceMapping
 from plr.protos.model.members import AT_MOST_EVERY_INTERFACE, CandidateSet, InterfaceLabel, ServiceSet
 from plr.protos.model.report import InterfaceJointReport, JointReport, Report
 from plr.protos.model.status import SyncState
@@ -126,10 +126,20 @@ def test_it_remembers_what_changed_and_why(world: World) -> None:
     assert after.changes[0].age_s <= 3.0
     assert after.in_force_s == pytest.approx(after.changes[0].age_s)
     assert [change.version for change in after.changes[1:]] == [change.version for change in before.changes]
-    assert "one of its paths came or went" in after.changes[0].mapping.reason
+    assert "moved because wlan0 to a is down" in after.changes[0].mapping.reason
     down = next(pair for pair in after.pairs if pair.path == on("wlan0", "a"))
     assert (down.up, down.miss) == (False, None)
     assert after.changes[0].mapping.reason in render(after)
+
+
+def test_without_a_mapping_it_names_the_live_paths_and_predicts_nothing(world: World) -> None:
+    measured(world, world.sidecars[ROBOT], seconds=10, misses={})
+    found = replace(asked(world), mapping=ServiceMapping(PLAN, (), 1.0, "no plan yet"))
+    section = render(found).split("pairs (")[0]
+    assert "the fastest first; it last reported these up: wlan0 -> a, " in section
+    assert "reason: no plan yet" in section
+    assert "predicted" not in section
+    assert "last reported these up" in render(replace(found, mapping=None))
 
 
 def test_what_paths_share_and_what_they_cost_is_told() -> None:

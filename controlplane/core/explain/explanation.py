@@ -19,7 +19,7 @@ from plr.protos.model.ids import Role
 from plr.protos.model.mapping import Assignment
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Iterable, Iterator, Mapping
+    from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 
     from plr.controlplane.core.estimate.estimator import Evidence
     from plr.controlplane.core.estimate.posterior import Estimate
@@ -44,6 +44,9 @@ MIN_COMMON_REQUESTS = 20.0
 
 MAX_SHOWN_PAIRS = 1024
 """Pairs reported, those in use and then the best ones: what the estimator keeps of one robot."""
+
+MAX_LOST_SHOWN = 3
+"""Clouds named whose ROS node of a service is gone."""
 
 MAX_COMPARED_NAMES = 32
 """Names compared in full with one that is unknown, those with the most alike at both ends: to compare two long ones
@@ -85,23 +88,41 @@ def find(registry: Registry, permits: Permits, robot: NodeName, service: Service
         raise UnknownNameError(f"{robot} is a cloud: ask about a robot")
     group = permits.group(robot)
     offered: set[ServiceName] = set()
+    lost: list[NodeName] = []
     clouds = 0
     for other in registry:
         if other.role is Role.CLOUD:
             names = {offer.name for offer in other.offers}
             offered |= names
-            clouds += service in names and service in permits.of(group, other)
-    return sidecar, find_use(sidecar, service, offered, clouds)
+            if service not in other.offered or service not in permits.of(group, other):
+                continue
+            if service in names:
+                clouds += 1
+            else:
+                lost.append(other.name)
+    return sidecar, find_use(sidecar, service, offered, clouds, lost)
 
 
 def find_use(
-    robot: Sidecar, service: ServiceName, offered: Collection[ServiceName] = (), clouds: int = 0
+    robot: Sidecar,
+    service: ServiceName,
+    offered: Collection[ServiceName] = (),
+    clouds: int = 0,
+    lost: Sequence[NodeName] = (),
 ) -> ServiceUse:
     """Return the robot's use of the service; `offered` is what any cloud offers, `clouds` how many let it call this
-    service. Raise UnknownNameError if there is none."""
+    service, and `lost` lists those that would but whose ROS node of it is gone. Raise UnknownNameError if there is
+    none."""
     for use in robot.uses:
         if use.name == service:
             return use
+    if lost and not clouds:
+        where = ", ".join(lost[:MAX_LOST_SHOWN])
+        where += f" and {len(lost) - MAX_LOST_SHOWN} more" if len(lost) > MAX_LOST_SHOWN else ""
+        raise UnknownNameError(
+            f"{robot.name} carries no {service}: the ROS node that served it on {where}"
+            " is gone, and no other cloud offers it; the sidecar there runs: start the node again"
+        )
     if service in robot.unreached:
         raise UnknownNameError(
             f"{robot.name} carries no {service}: {clouds} clouds offer it, but the robot reaches none of them;"

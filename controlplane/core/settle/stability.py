@@ -21,7 +21,7 @@ from plr.controlplane.core.problem.problem import Objective, block_excess, limit
 from plr.controlplane.core.settle.certainty import probability_better, probability_met
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Collection, Mapping, Sequence
 
     from plr.controlplane.core.problem.plan import BlockPlan, Plan
     from plr.controlplane.core.problem.problem import Block, BlockKey, Choice, FleetKey, Problem
@@ -55,6 +55,9 @@ CLEARLY = 0.8
 TROUBLE = 1e-3
 """No path is trusted to miss less often when a gain is weighed: one that has not missed for minutes may go dark now,
 and then the others matter."""
+
+MAX_NAMED = 3
+"""Servers, interfaces or paths that a reason names."""
 
 
 class _Difference(NamedTuple):
@@ -97,7 +100,7 @@ class Stability:
                 key = difference.block.key
                 choices[key] = difference.new
                 if key in running.blocks:
-                    why[key] = _reason(difference)
+                    why[key] = _reason(difference, running.blocks[key], alone=len(together) == 1)
                     self._changed.setdefault(key, deque(maxlen=MAX_MOVES)).append(now)
         plan = make_plan(problem, choices, bound=new.bound, unproven=new.unproven, before=running.blocks)
         return replace(plan, blocks={key: _said(block, running, why) for key, block in plan.blocks.items()})
@@ -263,15 +266,47 @@ def _missed_in_trouble(block: Block, choice: Choice) -> float:
     return joint_miss(replace(block, epsilon=epsilon), choice)
 
 
-def _reason(difference: _Difference) -> str:
-    if difference.old is None:
-        return "moved because one of its paths came or went"
-    target = difference.block.target
-    if target is not None:
-        paid, pays = (charge(target, choice) for choice in (difference.old, difference.new))
+def _reason(difference: _Difference, before: BlockPlan, *, alone: bool) -> str:
+    """Return why a choice changes from that of `before`; `alone`: no other block changes with it."""
+    block, old, new = difference.block, difference.old, difference.new
+    if old is None:
+        return f"moved because {_what_came_or_went(block, before)}"
+    if block.target is not None:
+        paid, pays = (charge(block.target, choice) for choice in (old, new))
         if pays < paid:
             return f"moved because a request cost {paid:.3g}, now {pays:.3g}"
-    then, now = (joint_miss(difference.block, choice) for choice in (difference.old, difference.new))
-    if then <= now:
-        return "moved to make room for others"
-    return f"moved because all copies would have missed with probability {then:.2g}, now {now:.2g}"
+    then, now = (joint_miss(block, choice) for choice in (old, new))
+    if then > now:
+        return f"moved because all copies would have missed with probability {then:.2g}, now {now:.2g}"
+    if violations(block, new) < violations(block, old):
+        return "moved so that its copies share less: no region, carrier or server beyond its capacity"
+    if not alone:
+        return "moved, although it gains nothing, because another service gains more from the server that it leaves"
+    if difference.load:
+        return "moved off a server that had more requests than its capacity for all robots"
+    return f"moved because its copies one by one miss less, although all together miss with probability {now:.2g}"
+
+
+def _what_came_or_went(block: Block, before: BlockPlan) -> str:
+    """Return why the choice of `before` does not fit the block any more."""
+    servers = {server for _, server in before.assignments if server not in block.servers}
+    if servers:
+        return f"{_some(servers)} left, or no longer offers the service to this robot"
+    used = {interface for interface, _ in before.assignments}
+    if dark := used.difference(block.interfaces):
+        return f"no path over {_some(dark)} is up any more"
+    down = {
+        f"{interface} to {server}"
+        for interface, server in before.assignments
+        if block.epsilon[block.interfaces.index(interface)][block.servers.index(server)] is None
+    }
+    if down:
+        return f"{_some(down)} is down"
+    if came := set(block.interfaces).difference(used):
+        return f"{_some(came)} can carry requests now"
+    return "what the service may use has changed"
+
+
+def _some(names: Collection[str]) -> str:
+    shown = sorted(names)
+    return " and ".join(shown[:MAX_NAMED]) + (f" and {len(shown) - MAX_NAMED} more" if len(shown) > MAX_NAMED else "")

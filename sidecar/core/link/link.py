@@ -309,8 +309,10 @@ class Link:
         stirred, self._stirred = self._stirred, {}
         for path in stirred.values():
             self._keeper.report_measured(path)
-            path.recovery.reordering.forget_old(now)
-            if path.recovery.reordering.remembers:
+            recovery = path.recovery
+            path.recent_loss.note(recovery.total_sent, recovery.total_lost - recovery.reordering.spurious, now)
+            recovery.reordering.forget_old(now)
+            if recovery.reordering.remembers:
                 self._stirred[path.id] = path
         for peer in {path.peer for path in stirred.values()}:
             self._publish_stats_of(peer)

@@ -11,6 +11,7 @@ from plr.sidecar.core.path.introductions import Introductions
 from plr.sidecar.core.path.owed import Owed
 from plr.sidecar.core.path.pmtu import PathMtu
 from plr.sidecar.core.path.probing import Probing
+from plr.sidecar.core.path.recent_loss import RecentLoss
 from plr.sidecar.core.path.recovery import Recovery
 from plr.sidecar.core.path.report import PathReport
 from plr.sidecar.core.path.send_queue import SendQueue
@@ -63,6 +64,7 @@ class Path:
         "probing",
         "queue",
         "received",
+        "recent_loss",
         "recovery",
         "remote_id",
         "renewed_at",
@@ -119,6 +121,7 @@ class Path:
         """Pings that wait to leave."""
         self.probing = Probing(now, rng, leads=leads)
         self._report = PathReport()
+        self.recent_loss = RecentLoss(now)
         self.bytes_sent = 0
         self.renewed_at: float | None = None
         """When our credential was renewed, until the peer answers an introduction with it."""

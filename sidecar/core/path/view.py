@@ -9,6 +9,7 @@ if TYPE_CHECKING:
     from plr.protos.model.ids import Address
     from plr.sidecar.core.base.values import PathId, PathState
     from plr.sidecar.core.path.path import Path
+    from plr.sidecar.core.path.recent_loss import Recent
 
 
 @dataclass(frozen=True, slots=True)
@@ -28,6 +29,8 @@ class PathView:
     lost: int
     spurious: int
     """Lost datagrams that were acknowledged after all."""
+    recent: Recent
+    """What was sent and lost in the last minute or so."""
     max_datagram: int
     """Bytes of UDP payload that the path is known to carry."""
     proven_at: float
@@ -41,15 +44,17 @@ class PathView:
 def view_of(path: Path, now: float) -> PathView:
     """Return the current view of `path`."""
     recovery, probing = path.recovery, path.probing
+    sent, lost, spurious = recovery.total_sent, recovery.total_lost, recovery.reordering.spurious
     return PathView(
         path.id,
         path.state,
         path.remote,
         len(path.candidates),
         recovery.rtt.smoothed,
-        recovery.total_sent,
-        recovery.total_lost,
-        recovery.reordering.spurious,
+        sent,
+        lost,
+        spurious,
+        path.recent_loss.until(sent, lost - spurious, now),
         path.mtu.size,
         probing.proven_at,
         probing.used_at,

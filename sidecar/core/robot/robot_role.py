@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import partial
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 from plr.sidecar.core.base.report_scope import ReportScope
 from plr.sidecar.core.base.slices import rest
@@ -21,7 +21,7 @@ from plr.sidecar.core.seam.links import Seek
 from plr.sidecar.core.wire.messages import RejectionMessage, RequestMessage, ResponseMessage
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Iterator
+    from collections.abc import Collection, Iterator, Mapping
 
     from plr.protos.model.ids import InterfaceName, NodeName, ServiceName, SessionId
     from plr.protos.model.mapping import MappingSet, ServiceMapping
@@ -35,6 +35,17 @@ if TYPE_CHECKING:
     from plr.sidecar.core.seam.links import PathMeasured
     from plr.sidecar.core.transfer.engine_parts import EngineParts
     from plr.sidecar.core.wire.messages import ServiceMessage
+
+
+class Destinations(NamedTuple):
+    """Where the requests of a robot may go."""
+
+    services: Mapping[ServiceName, tuple[tuple[NodeName, ...], bool]]
+    """Service offered here -> (its servers, whether its requests are idempotent)."""
+    out_of_favour: frozenset[NodeName]
+    """Servers that get requests only if there are no others."""
+    conflicts: frozenset[tuple[ServiceName, NodeName, str]]
+    """(service, server, type) of the servers that get no requests, because of their type."""
 
 
 class RobotRole:
@@ -123,6 +134,15 @@ class RobotRole:
     def service_mappings(self) -> tuple[ServiceMapping, ...]:
         """Return the mapping in force."""
         return tuple(self.mapping.services.values())
+
+    def destinations(self, now: float) -> Destinations:
+        """Return where new requests may go: what `MappingTable.choose` needs, besides the paths and the mapping."""
+        offered = {name: self.catalog.find(name) for name in self.catalog.offered}
+        return Destinations(
+            {name: (one.servers, one.rule.idempotent) for name, one in offered.items() if one is not None},
+            frozenset(one.server for one in self._penalties.report(now)),
+            frozenset(self.catalog.conflicts),
+        )
 
     def take_urgency(self) -> ReportScope | None:
         """Return what to report before the next report, since a path changed or a deadline was missed."""

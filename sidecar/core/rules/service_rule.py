@@ -106,6 +106,11 @@ class ServiceRule:
     cost_per_request: float = 0.0
     """Cloud: cost of a request that runs here."""
 
+    @property
+    def is_name(self) -> bool:
+        """Whether `pattern` is the name of one service, not a glob."""
+        return not _GLOB_CHARACTERS.intersection(self.pattern)
+
 
 class Rules:
     """The configuration's rules in their order, asked by name.

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import logging
+import math
 from typing import TYPE_CHECKING
 
+from plr.protos.model.ids import ServiceName
 from plr.sidecar.core.rules.service_rule import Rules
 from plr.sidecar.ros.errors import RosBridgeError
 from plr.sidecar.ros.graph import graph
@@ -14,7 +16,6 @@ from plr.sidecar.ros.types import TypeNotInstalledError, load_service_type
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping
 
-    from plr.protos.model.ids import ServiceName
     from plr.sidecar.core.rules.service_rule import ServiceRule
     from plr.sidecar.core.seam.application import OfferService, WithdrawService
     from plr.sidecar.ros.ros_loop import RosLoop
@@ -47,6 +48,8 @@ class Proxies:
         self._loop = loop
         self._own_node = loop.node.get_fully_qualified_name()
         self._rules = Rules(rules)
+        self._configured = {ServiceName(rule.pattern): rule.type for rule in rules if rule.type and rule.is_name}
+        """Types that the configuration names; those that prove to be installed are removed."""
         self._stats = stats
         self._on_closed = on_closed
         self.offers: dict[ServiceName, str] = {}
@@ -56,6 +59,7 @@ class Proxies:
         self._left_alone: dict[ServiceName, frozenset[str]] = {}
         self._free_since: dict[ServiceName, float] = {}
         self._types_retried_at = 0.0
+        self._configured_tried_at = -math.inf
         self.settling = False
         """Whether a name is about to be free, so that another scan is needed soon."""
         self._settled_at = now + DISCOVERY_SETTLES_S
@@ -85,6 +89,17 @@ class Proxies:
             log.warning("service %s: only its fallback answers from now on: %s", event.name, event.reason)
         elif self._close_proxy(event.name):
             log.warning("service %s is withdrawn: %s", event.name, event.reason)
+        self._publish_state()
+
+    def try_configured_types(self, now: float) -> Iterator[None]:
+        """Look in steps whether the types that the configuration names are installed, before any server offers them."""
+        if not self._configured or now < self._configured_tried_at + TYPE_RETRY_S:
+            return
+        self._configured_tried_at = now
+        for name, type_name in list(self._configured.items()):
+            if name not in self.offers:
+                self._try_configured(name, type_name)
+                yield
         self._publish_state()
 
     def follow(
@@ -139,15 +154,28 @@ class Proxies:
         else:
             log.warning("service %s is already served by %s on this robot: left alone", name, nodes)
 
+    def _try_configured(self, name: ServiceName, type_name: str) -> None:
+        try:
+            load_service_type(type_name)
+        except RosBridgeError as error:
+            self._note_missing_type(name, type_name, error)
+            return
+        del self._configured[name]
+        if self._missing_types.pop(name, None) is not None:
+            log.info("service %s: its type %s is installed now", name, type_name)
+
+    def _note_missing_type(self, name: ServiceName, type_name: str, error: RosBridgeError) -> None:
+        if name not in self._missing_types:
+            self._missing_types[name] = type_name
+            kind = "type_not_installed" if isinstance(error, TypeNotInstalledError) else "service_refused"
+            self._stats.errors[kind] += 1
+            log.error("service %s is not offered here: %s", name, error)
+
     def _open_proxy(self, name: ServiceName, type_name: str) -> None:
         try:
             proxy = ServiceProxy(self._loop.node, name, load_service_type(type_name))
         except RosBridgeError as error:
-            if name not in self._missing_types:
-                self._missing_types[name] = type_name
-                kind = "type_not_installed" if isinstance(error, TypeNotInstalledError) else "service_refused"
-                self._stats.errors[kind] += 1
-                log.error("service %s is not offered here: %s", name, error)
+            self._note_missing_type(name, type_name, error)
             return
         self._missing_types.pop(name, None)
         self._proxies[name] = proxy

@@ -319,6 +319,7 @@ class RobotSide:
 
     def scan(self) -> Iterator[None]:
         """Compare the graph with what is offered and with the fallbacks, in small steps."""
+        yield from self._proxies.try_configured_types(time.monotonic())
         if not self._proxies.offers and not self._fallbacks.configured:
             return
         wanted = frozenset(self._proxies.offers) | self._fallbacks.wanted

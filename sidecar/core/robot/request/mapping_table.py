@@ -24,9 +24,10 @@ if TYPE_CHECKING:
 class MappingTable:
     """The mapping in force and the choice of paths."""
 
-    def __init__(self, routes: Routes) -> None:
+    def __init__(self, routes: Routes, services: Iterable[ServiceMapping] = ()) -> None:
+        """Begin with the mapping of these services, by default of none."""
         self._routes = routes
-        self._services: dict[ServiceName, ServiceMapping] = {}
+        self._services: dict[ServiceName, ServiceMapping] = {one.service: one for one in services}
         self.version = Version(0)
 
     @property

@@ -62,7 +62,23 @@ def test_a_mapping_to_nowhere_is_said_so() -> None:
         "",
         services=(ServiceMapping(PLAN, (), 1.0, "no live server"),),
     )
-    assert "/plan: nowhere (predicted miss 1; no live server)" in render([robot])
+    assert "/plan: no mapping (no live server); no path is up\n" in render([robot]) + "\n"
+
+
+def test_without_a_mapping_the_paths_that_are_up_are_told_and_no_miss_is_predicted() -> None:
+    wlan, wwan = InterfaceName("wlan0"), InterfaceName("wwan0")
+    robot = SidecarStatus(
+        Peer(NodeName("robot"), Role.ROBOT, SessionId(2), b"", 1),
+        True,
+        1.0,
+        "",
+        services=(ServiceMapping(PLAN, (), 1.0, "no plan yet"),),
+        paths=tuple(PathReport(name, NodeName("cloud-a"), name is wlan, histogram()) for name in (wlan, wwan)),
+    )
+    text = render([robot])
+    assert "/plan: no mapping (no plan yet); if the robot knows a server of it, requests go over what is up: " in text
+    assert "what is up: wlan0 -> cloud-a\n" in text
+    assert "predicted" not in text
 
 
 def test_fallbacks_are_shown_where_there_are_any() -> None:
@@ -155,7 +171,7 @@ def test_what_is_wrong_is_not_cut_off() -> None:
     assert f"UNMET {PLAN}" in text
     assert "wwan0 DOWN" in text
     assert "/s0: wlan0 -> EDGE-1" in text
-    assert "/last: nowhere" in text
+    assert "/last: no mapping" in text
 
 
 @pytest.mark.audit("ops-5")

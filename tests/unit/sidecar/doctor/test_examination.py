@@ -22,6 +22,7 @@ from plr.sidecar.doctor.examination import (
     Where,
     _certificate_and_clock,
     _judged,
+    _ros,
     _wrong,
     connect,
     sockets,
@@ -159,3 +160,27 @@ def test_files_that_only_others_may_read_are_judged_by_the_sidecars_word(
     assert levels() == [Level.OK]
     state["certificate"]["refused"] = {"start": False, "text": f"{folder}/key.pem: expected a private key in PEM"}
     assert levels() == [Level.OK, Level.FAIL]
+
+
+@pytest.mark.parametrize(
+    ("problem", "installed", "expected"),
+    [
+        (None, True, (Level.OK, "installed: /plan (nowhere_msgs/srv/Absent)")),
+        (None, False, (Level.FAIL, "/plan: its type nowhere_msgs/srv/Absent is not installed in the sidecar's")),
+        (
+            "ROS 2's rclpy is missing",
+            False,
+            (Level.WARN, "not checked, because ROS does not work here: /plan (nowhere"),
+        ),
+    ],
+)
+def test_a_configured_type_is_looked_for_before_any_server_offered_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, problem: str | None, installed: bool, expected: tuple[Level, str]
+) -> None:
+    monkeypatch.setattr("plr.sidecar.ros.environment.problem", lambda *_, **__: problem)
+    monkeypatch.setattr(examination, "_is_installed", lambda _: installed)
+    services = [{"name": "/plan", "deadline_ms": 100, "type": "nowhere_msgs/srv/Absent"}]
+    config = parse(ROBOT, services=services, state_dir=str(tmp_path))
+    (found,) = [one for one in _ros(Where(tmp_path / "sidecar.yaml"), config, None) if one.check == "types"]
+    assert found.level is expected[0]
+    assert found.text.startswith(expected[1])

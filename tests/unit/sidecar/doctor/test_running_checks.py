@@ -23,8 +23,13 @@ def path(interface: str, peer: str, state: str = "up", **changes: Any) -> dict[s
     return {
         "interface": interface, "peer": peer, "remote": 0, "address": ["192.0.2.1", 24700], "candidates": 1,
         "state": state, "since_s": 600.0, "reason": "answers" if state == "up" else "silent", "rtt_s": 0.02,
-        "sent": 1000, "lost": 1, "max_datagram": 1472, "proven_s": 0.2, "rests": False, **changes,
+        "sent": 1000, "lost": 1, "recent": {"window_s": 50.0, "sent": 500, "lost": 1},
+        "max_datagram": 1472, "proven_s": 0.2, "rests": False, **changes,
     }  # fmt: skip
+
+
+def losing(interface: str, peer: str, lost: int = 50, **changes: Any) -> dict[str, Any]:
+    return path(interface, peer, recent={"window_s": 50.0, "sent": 500, "lost": lost}, **changes)
 
 
 def stun(**changes: Any) -> dict[str, Any]:
@@ -113,7 +118,25 @@ def test_with_nothing_reached_it_fails_but_not_just_after_the_start() -> None:
     assert "cloud-a announced no address" in text
     young = state(paths=dark, node={**state()["node"], "up_s": 2.0})
     assert texts(running_checks.paths(young, {}), Level.FAIL) == []
-    assert len(texts(running_checks.paths(state(paths=[]), {}), Level.WARN)) == 1
+
+
+@pytest.mark.parametrize(
+    ("changes", "why"),
+    [
+        ({"control": {"names": ["cp:50051"], "connected": False, "last_failure": "connection refused"}},
+         "no peer is known: the control plane cp:50051 is not reached (connection refused), and no peer is known"),
+        ({"control": {"names": ["cp:50051"], "connected": True}},
+         "no peer is known: the control plane names no cloud server to this node; none is registered, or the policy"),
+        ({"refused_peers": [{"name": "cloud-a", "why": "it is revoked"}]}, "no peer is accepted: all that the control"),
+    ],
+)  # fmt: skip
+def test_a_robot_without_a_peer_fails_and_says_why(changes: dict[str, Any], why: str) -> None:
+    (text,) = texts(running_checks.paths(state(paths=[], **changes), {}), Level.FAIL)
+    assert text.startswith(why)
+    node = state()["node"]
+    for other in ({**node, "up_s": 2.0}, {**node, "role": "cloud"}):
+        (text,) = texts(running_checks.paths(state(paths=[], node=other, **changes), {}), *BAD)
+        assert texts(running_checks.paths(state(paths=[], node=other, **changes), {}), Level.FAIL) == []
 
 
 def test_pings_are_shown_and_missed_ones_warned_of() -> None:
@@ -126,8 +149,8 @@ def test_pings_are_shown_and_missed_ones_warned_of() -> None:
 
 
 def test_a_lossy_or_unstable_path_is_warned_of() -> None:
-    lossy = state(paths=[path("wlan0", "cloud-a", lost=100)])
-    assert "10 % lost" in texts(running_checks.paths(lossy, {}), Level.WARN)[0]
+    lossy = state(paths=[losing("wlan0", "cloud-a")])
+    assert "10 % of 500 datagrams lost in the last 50 s" in texts(running_checks.paths(lossy, {}), Level.WARN)[0]
     unstable = state(paths=[path("wlan0", "cloud-a", "unstable")])
     assert "unstable" in texts(running_checks.paths(unstable, {}), Level.WARN)[0]
 
@@ -167,6 +190,20 @@ def test_stun_that_is_not_answered_is_warned_of_unless_the_other_family_is() -> 
     assert len(texts(running_checks.stun(state(interfaces=[interface("wlan0", stun=[])])), Level.WARN)) == 1
 
 
+@pytest.mark.parametrize(
+    ("servers", "expected"),
+    [
+        (["cp.example:3479", "[2001:db8::1]:3478"], "check 3479/udp of cp.example, 3478/udp of [2001:db8::1], a route"),
+        ([f"stun-{number}:9000" for number in range(5)], "9000/udp of stun-2 and of 2 more, a route"),
+        ([], "check the UDP port of the STUN servers, a route"),
+    ],
+)
+def test_a_silent_stun_server_is_named_with_its_own_port(servers: list[str], expected: str) -> None:
+    silent = interface("wlan0", stun=[stun(mapping=None, answered_s=None, problem="no answer")])
+    told = state(interfaces=[silent], node={**state()["node"], "stun_servers": servers})
+    assert expected in next(running_checks.stun(told)).remedy
+
+
 def test_a_path_that_carries_the_least_only_is_warned_of() -> None:
     stuck = state(paths=[path("wlan0", "cloud-a", max_datagram=1200)])
     (text,) = texts(running_checks.mtu(stuck), Level.WARN)
@@ -201,6 +238,48 @@ def test_who_is_gone_is_told_until_it_is_back() -> None:
 def test_services() -> None:
     told = {"carried": {}, "unmet": ["/plan"], "left_alone": {"/map": ["/map_server"]}, "missing_types": {}}
     assert len(texts(running_checks.services(state(services=told)), Level.WARN)) == 3
+
+
+UNMET = {"carried": {}, "unmet": ["/map", "/plan"]}
+NO_CLOUD = "configured, but not offered by any cloud server that the control plane names to this robot"
+
+
+@pytest.mark.parametrize(
+    ("told", "expected"),
+    [
+        (UNMET, [f"/map: {NO_CLOUD}", f"/plan: {NO_CLOUD}", "none is offered: no server offers what is configured"]),
+        ({**UNMET, "unmet": ["/plan"], "conflicts": [{"service": "/plan", "server": "cloud-a", "type": "a/srv/B"}]},
+         ["/plan: cloud-a offers it as a/srv/B, unlike the configuration or the other servers, so it gets no requests "
+          "there", "none is offered: no server offers what is configured"]),
+        ({"carried": {}, "unreached": {"/plan": 2}},
+         ["/plan: offered by 2 servers that this robot knows, but none of them is reached",
+          "none is offered: no server of a configured service is reached"]),
+        ({"carried": {}}, ["none is offered: no server that this robot knows offers a service that services names"]),
+    ],
+)  # fmt: skip
+def test_a_robot_without_a_single_service_fails_and_says_why(told: dict[str, Any], expected: list[str]) -> None:
+    assert texts(running_checks.services(state(services=told)), Level.FAIL) == expected
+    young = state(services=told, node={**state()["node"], "up_s": 2.0})
+    assert texts(running_checks.services(young), Level.FAIL) == []
+    one_left = {**told, "carried": {"/other": "a/srv/B"}}
+    assert texts(running_checks.services(state(services=one_left)), Level.FAIL) == []
+    alone = texts(running_checks.services(state(services=told, paths=[])), Level.FAIL)
+    assert alone[-1] == "none is offered, because no peer is known"
+    assert not any("control plane names" in text for text in alone)
+
+
+def test_a_cloud_that_offers_nothing_is_warned_only() -> None:
+    cloud = {**state()["node"], "role": "cloud"}
+    assert texts(running_checks.services(state(services=UNMET, node=cloud)), Level.FAIL) == []
+
+
+def test_one_odd_server_of_a_service_that_others_serve_is_warned_of() -> None:
+    told = {
+        "carried": {"/plan": "a/srv/A"},
+        "conflicts": [{"service": "/plan", "server": "cloud-b", "type": "a/srv/B"}],
+    }
+    (text,) = texts(running_checks.services(state(services=told)), *BAD)
+    assert text.startswith("/plan: cloud-b offers it as a/srv/B, unlike")
 
 
 def test_a_server_whose_qos_does_not_fit_blames_no_name() -> None:
@@ -248,12 +327,47 @@ def test_the_mapping() -> None:
     assert "wlan0 to cloud-a is down" in text
 
 
+def ways(*paths: tuple[str, str]) -> dict[str, Any]:
+    return {"service": "/plan", "paths": [{"interface": name, "server": server} for name, server in paths]}
+
+
+LIVE = "requests go over these live paths: wlan0 to cloud-a, wwan0 to cloud-b"
+
+
+@pytest.mark.parametrize("version", [0, 7])
+@pytest.mark.parametrize("reason", [None, "no live server offers it as nav_msgs/srv/GetPlan"])
+def test_without_a_mapping_the_live_paths_are_told(version: int, reason: str | None) -> None:
+    (mapped,) = state()["mapped"]
+    empty = [] if reason is None else [{**mapped, "pairs": [], "predicted_miss": 1.0, "reason": reason}]
+    live = [ways(("wlan0", "cloud-a"), ("wwan0", "cloud-b"))]
+    told = state(mapped=empty, ways=live, mapping={"version": version, "source": "control plane", "age_s": 1.0})
+    found = texts(running_checks.mapping(told, lambda _: 0.01), *BAD)
+    assert f"/plan: no mapping from the control plane ({reason or 'not sent yet'}); {LIVE}" in found
+    assert not any("predicted" in text or "no path" in text for text in found)
+    assert texts(running_checks.mapping(told, lambda _: 0.01), Level.FAIL) == []
+
+
+def test_what_replaces_a_mapped_path_that_is_down_is_told() -> None:
+    paths = [path("wlan0", "cloud-a", "down"), path("wwan0", "cloud-b")]
+    told = state(paths=paths, ways=[ways(("wwan0", "cloud-b"))])
+    (text,) = texts(running_checks.mapping(told, lambda _: None), Level.WARN)
+    assert text.endswith("wlan0 to cloud-a is down; requests go over these live paths: wwan0 to cloud-b")
+    (text,) = texts(running_checks.mapping({**told, "ways": [ways()]}, lambda _: None), Level.FAIL)
+    assert text.endswith("no other path to a server of it is up")
+
+
 @pytest.mark.audit("ops-14")
 def test_a_mapping_that_leads_nowhere_fails_and_a_hopeless_one_is_warned_of() -> None:
     (mapped,) = state()["mapped"]
     nowhere = state(mapped=[{**mapped, "pairs": [], "predicted_miss": 1.0}])
-    (text,) = texts(running_checks.mapping(nowhere, lambda _: None), Level.FAIL)
-    assert text.startswith("/plan goes over no path")
+    (text,) = texts(running_checks.mapping({**nowhere, "ways": [ways()]}, lambda _: None), Level.FAIL)
+    assert text == (
+        "/plan: no mapping from the control plane, and no path to a server of it is up: requests go nowhere"
+    )
+    # A sidecar of an earlier version does not say over which paths requests go.
+    assert texts(running_checks.mapping(nowhere, lambda _: None), Level.FAIL) == []
+    dark = state(mapped=nowhere["mapped"], paths=[path("wlan0", "cloud-a", "down")])
+    assert len(texts(running_checks.mapping(dark, lambda _: None), Level.FAIL)) == 1
     hopeless = state(mapped=[{**mapped, "predicted_miss": 0.97}])
     assert "predicted to miss 97 %" in texts(running_checks.mapping(hopeless, lambda _: None), Level.WARN)[0]
     assert texts(running_checks.mapping(state(), lambda _: None), *BAD) == []
@@ -270,7 +384,9 @@ def test_a_server_that_stands_still_is_named() -> None:
 def test_the_control_stream() -> None:
     lost = {"names": ["cp:50051"], "connected": False, "since_s": 90.0, "last_failure": "nothing arrives over wlan0"}
     (text,) = texts(running_checks.control(state(control=lost)), Level.WARN)
-    assert text.startswith("cp:50051 not reached for 90 s: nothing arrives over wlan0")
+    assert text.startswith("cp:50051 not reached for 90 s: nothing arrives over wlan0; requests continue")
+    nothing = state(control=lost, mapping={"version": 0}, paths=[])
+    assert "nothing that it sent before is known" in texts(running_checks.control(nothing), Level.WARN)[0]
 
 
 def test_a_socket_that_could_not_be_opened_fails() -> None:

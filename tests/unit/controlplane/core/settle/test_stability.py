@@ -178,7 +178,7 @@ def test_a_dead_path_moves_no_robot_that_is_not_in_the_way() -> None:
     settled = settled_of(problem, make_plan(problem, {alive.key: (0,), dying.key: (1,)}), old)
     assert settled.blocks[alive.key].assignments == (("if0", "cloud-1"),)
     assert settled.blocks[dying.key].assignments == (("if0", "cloud-1"),)
-    assert settled.blocks[dying.key].why == "moved because one of its paths came or went"
+    assert settled.blocks[dying.key].why == "moved because if0 to cloud-0 is down"
     assert settled.blocks[alive.key].why == ""
 
 
@@ -231,7 +231,38 @@ def test_every_change_says_why_until_the_next_one() -> None:
     for now in (1.0, 2.0):
         plan = stability.settle(later, better, plan, now)
         assert plan.blocks[two.key].why == "moved because all copies would have missed with probability 0.9, now 0.001"
-        assert plan.blocks[one.key].why == "moved to make room for others"
+        assert plan.blocks[one.key].why == (
+            "moved, although it gains nothing, because another service gains more from the server that it leaves"
+        )
+
+
+@pytest.mark.parametrize(
+    ("servers", "epsilon", "chosen", "why"),
+    [
+        (("cloud-1",), [[0.2], [0.2]], (0, 0), "cloud-0 left, or no longer offers the service to this robot"),
+        (("cloud-0", "cloud-1"), [[None, 0.2], [0.1, 0.1]], (1, 0), "if0 to cloud-0 is down"),
+        (("cloud-0", "cloud-1"), [[0.1, 0.2]] * 3, (0, 1, 0), "if2 can carry requests now"),
+    ],
+)
+def test_a_choice_that_is_no_longer_valid_says_what_came_or_went(
+    servers: tuple[str, ...], epsilon: list[list[float | None]], chosen: tuple[int, ...], why: str
+) -> None:
+    before = block([[0.1, 0.2], [0.2, 0.1]])
+    old = make_plan(Problem((before,)), {before.key: (0, 1)})
+    after = replace(block(epsilon), servers=tuple(map(NodeName, servers)))
+    problem = Problem((after,))
+    settled = settled_of(problem, make_plan(problem, {after.key: chosen}), old)
+    assert settled.blocks[after.key].why == f"moved because {why}"
+
+
+def test_the_only_interface_in_use_that_goes_dark_is_named() -> None:
+    target = Target(0.5, ((1.0, 1.0), (1.0, 1.0)))
+    before = block([[0.1, 0.2], [0.2, 0.1]], copies=AT_MOST_EVERY_INTERFACE, target=target)
+    old = make_plan(Problem((before,)), {before.key: (None, 1)})
+    after = block([[0.1, 0.2]], copies=AT_MOST_EVERY_INTERFACE, target=Target(0.5, ((1.0, 1.0),)))
+    problem = Problem((after,))
+    settled = settled_of(problem, make_plan(problem, {after.key: (0,)}), old)
+    assert settled.blocks[after.key].why == "moved because no path over if1 is up any more"
 
 
 def test_a_change_that_exceeds_more_is_never_made() -> None:
@@ -273,3 +304,4 @@ def test_a_shared_region_is_left_although_that_misses_more() -> None:
     old = make_plan(problem, {part.key: (0, 1)})
     settled = settled_of(problem, solve(problem, time_limit_s=60), old)
     assert settled.blocks[part.key].shared == ()
+    assert settled.blocks[part.key].why.startswith("moved so that its copies share less")
