@@ -6,6 +6,7 @@ import os
 import subprocess
 import sys
 import textwrap
+from importlib.metadata import entry_points
 from typing import TYPE_CHECKING
 
 import pytest
@@ -179,3 +180,8 @@ def test_ctrl_c_is_answered_once_the_program_runs() -> None:
     script = script.replace("pass; os.kill(os.getpid(), signal.SIGINT)", "pass")
     done = from_a_terminal(script)
     assert (done.returncode, done.stderr) == (130, b"")
+
+
+def test_plr_lists_the_commands_of_the_sidecar() -> None:
+    installed = {each.name for each in entry_points(group="plr.commands")}
+    assert set(__main__._ON_A_NODE) == installed - {"operator"}
