@@ -14,6 +14,7 @@ from plr.controlplane.core.control.control import ControlCore, Settled
 from plr.controlplane.core.control.events import (
     CutOffNotice,
     DepartureNotice,
+    FaultNotice,
     NackNotice,
     OffersRefusedNotice,
     StreamLostNotice,
@@ -39,6 +40,7 @@ from plr.protos.convert import status_to_proto
 from plr.protos.model.fleet_events import EventKind, Why
 from plr.protos.model.ids import Role
 from plr.protos.model.members import NO_REVOCATIONS, RemovalReason, ServiceSet
+from plr.protos.model.status import Fault
 from plr.protos.trust.identity import EXPIRED, NOT_YET_VALID, REVOKED, CertificateError
 
 if TYPE_CHECKING:
@@ -99,6 +101,9 @@ def wall_clock_epoch() -> int:
 def _few(services: Sequence[ServiceName]) -> str:
     more = len(services) - MAX_SERVICES_LOGGED
     return ", ".join(services[:MAX_SERVICES_LOGGED]) + (f" and {more} more" if more > 0 else "")
+
+
+_FAULT_EVENTS = {Fault.FLAPPING: EventKind.FLAPPING, Fault.USELESS: EventKind.USELESS}
 
 
 @dataclass(slots=True)
@@ -337,6 +342,12 @@ class ControlLoop:
                     self._callers.pop(name, None)
                 case StreamLostNotice(sidecar=name, role=role) if not self._closing:
                     self.events.record(EventKind.STREAM_LOST, name, role=role)
+                case FaultNotice(sidecar=name, found=found, over=over):
+                    kind = EventKind.RECOVERED if over else _FAULT_EVENTS[found.fault]
+                    what = f" is no longer {found.fault.value}" if over else f": {found.text}"
+                    text = f"{found.interface}{what}"
+                    self._say(logging.INFO if over else logging.WARNING, name, "%s: %s: %s", name, kind.value, text)
+                    self._record(kind, name, text)
                 case CutOffNotice(sidecar=name, role=role, lifted=lifted):
                     self._say(
                         logging.INFO if lifted else logging.WARNING,

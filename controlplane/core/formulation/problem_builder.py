@@ -207,6 +207,13 @@ class Drawing:
         """Return whether it is to be drawn whatever it costs."""
         return robot in self._urgent
 
+    def blocks(self, robot: NodeName, services: Iterable[ServiceName]) -> Iterator[Block]:
+        """Yield the blocks of a robot's uses of these services as last drawn, as far as there are any."""
+        for service in services:
+            drawn = self._drawn.get(BlockKey(robot, service))
+            if drawn is not None and drawn.block is not None:
+                yield drawn.block
+
     def cost(self, robot: NodeName) -> int:
         """Return how many pairs it takes to draw a robot."""
         uses = self._frame.uses.get(robot, ()) if self._frame is not None else ()
