@@ -10,6 +10,7 @@ import grpc
 
 from plr.controlplane.core.publish.messages import CloseReason
 from plr.controlplane.core.registry.registry import Refusal
+from plr.controlplane.serve.access import first_words
 from plr.controlplane.serve.stream_encoder import StreamEncoder
 from plr.controlplane.serve.stream_limits import (
     MAX_FIRST_BYTES,
@@ -116,11 +117,12 @@ class ControlPlaneService:
         """Serve one stream until either side ends it."""
         who = context.peer()
         try:
-            caller = self._caller_of(context)
+            caller = await self._caller_of(context)
             if caller is not None:
                 who = caller.identity.name
             if not self._streams.enter(who):
                 self._loop.refused(TOO_MANY_STREAMS)
+                await first_words(context)
                 raise _StreamEndError(
                     grpc.StatusCode.RESOURCE_EXHAUSTED, f"{who} has {MAX_STREAMS_PER_NAME} streams open"
                 )
@@ -172,13 +174,16 @@ class ControlPlaneService:
             raise _StreamEndError(_REFUSAL_CODES[result], f"{registration.name}: {result.value}")
         return registration.name, *result, registration.incremental
 
-    def _caller_of(self, context: Context) -> Caller | None:
+    async def _caller_of(self, context: Context) -> Caller | None:
         if self._gate is None:
             return None
         caller = self._gate.caller(context.peer())
         # The guard saw a caller a moment ago; a connection that has ended since must not count as insecure mode.
-        if caller is None or caller.refusal is not None:
+        if caller is None:
             raise _StreamEndError(grpc.StatusCode.UNAUTHENTICATED, "the connection has ended")
+        if caller.refusal is not None:
+            await first_words(context)
+            raise _StreamEndError(grpc.StatusCode.UNAUTHENTICATED, str(caller.refusal))
         return caller
 
     @staticmethod
