@@ -198,7 +198,7 @@ class ControlLoop:
         result = self._core.register(registration, self._loop.time()) if refusal is None else self._core.refuse(refusal)
         if isinstance(result, Refusal):
             who = registration.name if caller is None else caller.identity.name
-            self.events.record(EventKind.REFUSED, who, f"registration: {result.value}")
+            self._tell_refused(who, result, result.value)
             return result
         if caller is not None:
             self._callers[registration.name] = caller
@@ -221,6 +221,15 @@ class ControlLoop:
         mailbox = self._mailboxes[result] = Mailbox()
         self._dispatch()
         return result, mailbox
+
+    def refuse(self, name: NodeName | None, refusal: Refusal, details: str) -> None:
+        """Note a first message that is refused before anything is registered; `name` is who sent it, if known."""
+        self._core.refuse(refusal)
+        if name is not None:
+            self._tell_refused(name, refusal, details)
+
+    def _tell_refused(self, name: NodeName, refusal: Refusal, details: str) -> None:
+        self.events.record_refusal(name, refusal.name, f"registration: {details}")
 
     async def prepare(self, message: SidecarMessage) -> None:
         """Look up in turns what the policy says of services not heard of before, ahead of `receive`."""
@@ -401,7 +410,7 @@ class ControlLoop:
 
     def refused_member(self, name: NodeName, error: CertificateError) -> None:
         """Record that a member's connection was refused."""
-        self.events.record(EventKind.REFUSED, name, f"connection: {error}")
+        self.events.record_refusal(name, error.reason, f"connection: {error}")
         why = Why.REVOKED if error.reason == REVOKED else Why.CERTIFICATE_EXPIRED
         if error.reason in {REVOKED, EXPIRED, NOT_YET_VALID}:
             self._core.note_refused(name, why, str(error))
