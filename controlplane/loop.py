@@ -48,6 +48,7 @@ if TYPE_CHECKING:
 
     from plr.controlplane.config.controlplane import ControlPlaneConfig
     from plr.controlplane.core.explain.departed import Departed
+    from plr.controlplane.core.explain.explanation import Pairs
     from plr.controlplane.core.explain.fleet_view import MemberView
     from plr.controlplane.core.formulation.block import Picture
     from plr.controlplane.core.policy.policy import Policy
@@ -298,9 +299,12 @@ class ControlLoop:
         counts = Counter(sidecar.role for sidecar in self._core.registry)
         return f"sidecars connected: {counts[Role.ROBOT]} of robots, {counts[Role.CLOUD]} of clouds"
 
-    def explain(self, robot: NodeName, service: ServiceName) -> Explanation:
-        """Explain why requests go where they go; raises UnknownNameError if the robot or its service is unknown."""
-        return self._core.explain(robot, service, self._loop.time())
+    def explain(self, robot: NodeName, service: ServiceName) -> tuple[Explanation, Pairs]:
+        """Explain why requests go where they go; raises UnknownNameError if the robot or its service is unknown.
+
+        Return the explanation without its pairs, and these, to be read in turns.
+        """
+        return self._core.explain_in_parts(robot, service, self._loop.time)
 
     async def set_policy(self, policy: Policy | None) -> None:
         """Put another policy into force, once it is applied to all members: in turns, as there may be many rules."""

@@ -30,7 +30,7 @@ from plr.controlplane.core.estimate.reached import Reached
 from plr.controlplane.core.estimate.unanswered import Unanswered
 from plr.controlplane.core.explain.departed import Departed, Departure, departure, last_known, why_removed
 from plr.controlplane.core.explain.departed_explanation import explain_departed
-from plr.controlplane.core.explain.explanation import explain, find
+from plr.controlplane.core.explain.explanation import explain, find, whole
 from plr.controlplane.core.explain.faults import Faults
 from plr.controlplane.core.explain.fleet_view import MemberView, view_of
 from plr.controlplane.core.explain.returning import Returning
@@ -64,6 +64,7 @@ from plr.protos.model.stream import Ack, Drain, Heartbeat, Nack, ResourceKind, W
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Iterable, Iterator, Set
 
+    from plr.controlplane.core.explain.explanation import Pairs
     from plr.controlplane.core.policy.policy import Policy
     from plr.controlplane.core.registry.registry import Sidecar
     from plr.protos.model.explanation import Explanation
@@ -737,7 +738,17 @@ class ControlCore:
         )
 
     def explain(self, robot: NodeName, service: ServiceName, now: float) -> Explanation:
-        """Explain why requests go, or went, where they do. Raise UnknownNameError if robot or service is unknown."""
+        """Return all that `explain_in_parts` explains."""
+        return whole(self.explain_in_parts(robot, service, lambda: now))
+
+    def explain_in_parts(
+        self, robot: NodeName, service: ServiceName, clock: Callable[[], float]
+    ) -> tuple[Explanation, Pairs]:
+        """Explain why requests go, or went, where they do. Raise UnknownNameError if robot or service is unknown.
+
+        Return the explanation without its pairs, and these, made as they are read at the times that `clock` returns.
+        """
+        now = clock()
         gone = self.departed.get(robot)
         if gone is not None and gone.role is Role.ROBOT and self.registry.get(robot) is None:
             last = self.departed.last_known(robot)
@@ -753,7 +764,7 @@ class ControlCore:
             sent=mapping.sent or (),
             sync=mapping.status,
             history=self.history.of(BlockKey(robot, service)),
-            now=now,
+            clock=clock,
         )
 
     def sync_states(self) -> Iterator[tuple[NodeName, ResourceKind, SyncState]]:
