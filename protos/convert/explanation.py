@@ -43,6 +43,8 @@ from plr.protos.model.report import MAX_JOINTS
 from plr.protos.plr.v1 import admin_pb2
 
 if TYPE_CHECKING:
+    from collections.abc import Iterable
+
     from plr.protos.model.ids import NodeName, ServiceName
 
 MAX_LISTED_PAIRS = 4096
@@ -131,6 +133,11 @@ def explanation_to_proto(explanation: Explanation) -> admin_pb2.ExplainResponse:
         gone_us=microseconds(found.gone_s) if found.gone_s is not None else None,
         gone_reason=why_to_proto(found.gone_why),
     )
+
+
+def pairs_to_proto(pairs: Iterable[PairExplanation]) -> admin_pb2.ExplainResponse:
+    """Encode pairs as a part of an explanation that has none of its own."""
+    return admin_pb2.ExplainResponse(pairs=map(_pair_to_proto, pairs))
 
 
 def _optional(message: admin_pb2.ExplainResponse, field: Literal["observed_miss", "predicted_miss"]) -> float | None:
