@@ -1,10 +1,10 @@
 """Robot side: remembers the server to which shared requests of each service go, and when another one is tried.
 
 Shared requests stay at one server while it answers. Another one would begin with paths about which less is known, over
-the same networks. A server may be bad although its paths are up: its own network is slow, or it answers nothing. So after
-some missed deadlines in a row, a late request also goes to another server. The favourite had a head start, so whoever
-answers first is better. Under overload no server is better, and the paths to another one take capacity from those in
-use. So the time between two tries doubles with each try that is not answered by its deadline.
+the same networks. A server may be bad although its paths are up: its own network is slow, or it answers nothing. So
+after some missed deadlines in a row, a late request also goes to another server. The favourite had a head start, so
+whoever answers first is better. Under overload no server is better, and the paths to another one take capacity from
+those in use. So the time between two tries doubles with each try that is not answered by its deadline.
 """
 
 from __future__ import annotations
