@@ -241,6 +241,7 @@ def explain(
         joints=_joints(robot.name, use.name, block, estimator, now),
         alternatives=alternatives.of(picture.problem, plan, block, miss) if block is not None else (),
         changes=_changes(history, now),
+        redundancy=use.redundancy,
     )
     return head, _pairs(shown, chosen, notes, block, estimator, key, clock)
 

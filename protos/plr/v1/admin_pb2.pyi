@@ -949,6 +949,7 @@ class ExplainResponse(_message.Message):
     PREDICTED_MISS_FIELD_NUMBER: _builtins.int
     GONE_US_FIELD_NUMBER: _builtins.int
     GONE_REASON_FIELD_NUMBER: _builtins.int
+    REDUNDANCY_FIELD_NUMBER: _builtins.int
     robot: _builtins.str
     service: _builtins.str
     deadline_us: _builtins.int
@@ -970,6 +971,8 @@ class ExplainResponse(_message.Message):
     gone_us: _builtins.int
     """Present if the robot is gone: how long ago it went, and why. Everything else is as of then."""
     gone_reason: Global___DepartureReason.ValueType
+    redundancy: _types_pb2.RedundancyMode.ValueType
+    """How the robot sends copies of a request over the mapped pairs; absent from an older control plane."""
     @_builtins.property
     def mapping(self) -> _control_pb2.ServiceMapping:
         """As last sent; absent if nothing was."""
@@ -1008,10 +1011,11 @@ class ExplainResponse(_message.Message):
         predicted_miss: _builtins.float | None = ...,
         gone_us: _builtins.int | None = ...,
         gone_reason: Global___DepartureReason.ValueType = ...,
+        redundancy: _types_pb2.RedundancyMode.ValueType | None = ...,
     ) -> None: ...
-    _HasFieldArgType: _TypeAlias = _typing.Literal["_cost_per_request", b"_cost_per_request", "_gone_us", b"_gone_us", "_in_force_us", b"_in_force_us", "_observed_miss", b"_observed_miss", "_predicted_miss", b"_predicted_miss", "cost_per_request", b"cost_per_request", "gone_us", b"gone_us", "in_force_us", b"in_force_us", "mapping", b"mapping", "observed_miss", b"observed_miss", "predicted_miss", b"predicted_miss", "sync", b"sync"]  # noqa: Y015
+    _HasFieldArgType: _TypeAlias = _typing.Literal["_cost_per_request", b"_cost_per_request", "_gone_us", b"_gone_us", "_in_force_us", b"_in_force_us", "_observed_miss", b"_observed_miss", "_predicted_miss", b"_predicted_miss", "_redundancy", b"_redundancy", "cost_per_request", b"cost_per_request", "gone_us", b"gone_us", "in_force_us", b"in_force_us", "mapping", b"mapping", "observed_miss", b"observed_miss", "predicted_miss", b"predicted_miss", "redundancy", b"redundancy", "sync", b"sync"]  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["_cost_per_request", b"_cost_per_request", "_gone_us", b"_gone_us", "_in_force_us", b"_in_force_us", "_observed_miss", b"_observed_miss", "_predicted_miss", b"_predicted_miss", "alternatives", b"alternatives", "changes", b"changes", "cost_per_request", b"cost_per_request", "deadline_us", b"deadline_us", "gone_reason", b"gone_reason", "gone_us", b"gone_us", "idempotent", b"idempotent", "in_force_us", b"in_force_us", "joints", b"joints", "mapping", b"mapping", "objective", b"objective", "observed_miss", b"observed_miss", "pairs", b"pairs", "pairs_left_out", b"pairs_left_out", "predicted_miss", b"predicted_miss", "robot", b"robot", "service", b"service", "sync", b"sync", "target_miss", b"target_miss"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["_cost_per_request", b"_cost_per_request", "_gone_us", b"_gone_us", "_in_force_us", b"_in_force_us", "_observed_miss", b"_observed_miss", "_predicted_miss", b"_predicted_miss", "_redundancy", b"_redundancy", "alternatives", b"alternatives", "changes", b"changes", "cost_per_request", b"cost_per_request", "deadline_us", b"deadline_us", "gone_reason", b"gone_reason", "gone_us", b"gone_us", "idempotent", b"idempotent", "in_force_us", b"in_force_us", "joints", b"joints", "mapping", b"mapping", "objective", b"objective", "observed_miss", b"observed_miss", "pairs", b"pairs", "pairs_left_out", b"pairs_left_out", "predicted_miss", b"predicted_miss", "redundancy", b"redundancy", "robot", b"robot", "service", b"service", "sync", b"sync", "target_miss", b"target_miss"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     _WhichOneofReturnType__cost_per_request: _TypeAlias = _typing.Literal["cost_per_request"]  # noqa: Y015
     _WhichOneofArgType__cost_per_request: _TypeAlias = _typing.Literal["_cost_per_request", b"_cost_per_request"]  # noqa: Y015
@@ -1023,6 +1027,8 @@ class ExplainResponse(_message.Message):
     _WhichOneofArgType__observed_miss: _TypeAlias = _typing.Literal["_observed_miss", b"_observed_miss"]  # noqa: Y015
     _WhichOneofReturnType__predicted_miss: _TypeAlias = _typing.Literal["predicted_miss"]  # noqa: Y015
     _WhichOneofArgType__predicted_miss: _TypeAlias = _typing.Literal["_predicted_miss", b"_predicted_miss"]  # noqa: Y015
+    _WhichOneofReturnType__redundancy: _TypeAlias = _typing.Literal["redundancy"]  # noqa: Y015
+    _WhichOneofArgType__redundancy: _TypeAlias = _typing.Literal["_redundancy", b"_redundancy"]  # noqa: Y015
     @_typing.overload
     def WhichOneof(self, oneof_group: _WhichOneofArgType__cost_per_request) -> _WhichOneofReturnType__cost_per_request | None: ...
     @_typing.overload
@@ -1033,5 +1039,7 @@ class ExplainResponse(_message.Message):
     def WhichOneof(self, oneof_group: _WhichOneofArgType__observed_miss) -> _WhichOneofReturnType__observed_miss | None: ...
     @_typing.overload
     def WhichOneof(self, oneof_group: _WhichOneofArgType__predicted_miss) -> _WhichOneofReturnType__predicted_miss | None: ...
+    @_typing.overload
+    def WhichOneof(self, oneof_group: _WhichOneofArgType__redundancy) -> _WhichOneofReturnType__redundancy | None: ...
 
 Global___ExplainResponse: _TypeAlias = ExplainResponse  # noqa: Y015

@@ -406,4 +406,5 @@ explanations = st.builds(
     _tuples(explained_joints),
     _tuples(alternatives),
     _tuples(st.builds(MappingChange, durations, versions, service_mappings())),
+    st.none() | st.sampled_from(RedundancyMode),
 )
