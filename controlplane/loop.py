@@ -14,6 +14,7 @@ from plr.controlplane.core.control.control import ControlCore, Settled
 from plr.controlplane.core.control.events import (
     CutOffNotice,
     DepartureNotice,
+    FaultNotice,
     NackNotice,
     OffersRefusedNotice,
     StreamLostNotice,
@@ -39,6 +40,7 @@ from plr.protos.convert import status_to_proto
 from plr.protos.model.fleet_events import EventKind, Why
 from plr.protos.model.ids import Role
 from plr.protos.model.members import NO_REVOCATIONS, RemovalReason, ServiceSet
+from plr.protos.model.status import Fault
 from plr.protos.trust.identity import EXPIRED, NOT_YET_VALID, REVOKED, CertificateError
 
 if TYPE_CHECKING:
@@ -46,6 +48,7 @@ if TYPE_CHECKING:
 
     from plr.controlplane.config.controlplane import ControlPlaneConfig
     from plr.controlplane.core.explain.departed import Departed
+    from plr.controlplane.core.explain.explanation import Pairs
     from plr.controlplane.core.explain.fleet_view import MemberView
     from plr.controlplane.core.formulation.block import Picture
     from plr.controlplane.core.policy.policy import Policy
@@ -99,6 +102,9 @@ def wall_clock_epoch() -> int:
 def _few(services: Sequence[ServiceName]) -> str:
     more = len(services) - MAX_SERVICES_LOGGED
     return ", ".join(services[:MAX_SERVICES_LOGGED]) + (f" and {more} more" if more > 0 else "")
+
+
+_FAULT_EVENTS = {Fault.FLAPPING: EventKind.FLAPPING, Fault.USELESS: EventKind.USELESS}
 
 
 @dataclass(slots=True)
@@ -193,7 +199,7 @@ class ControlLoop:
         result = self._core.register(registration, self._loop.time()) if refusal is None else self._core.refuse(refusal)
         if isinstance(result, Refusal):
             who = registration.name if caller is None else caller.identity.name
-            self.events.record(EventKind.REFUSED, who, f"registration: {result.value}")
+            self._tell_refused(who, result, result.value)
             return result
         if caller is not None:
             self._callers[registration.name] = caller
@@ -216,6 +222,15 @@ class ControlLoop:
         mailbox = self._mailboxes[result] = Mailbox()
         self._dispatch()
         return result, mailbox
+
+    def refuse(self, name: NodeName | None, refusal: Refusal, details: str) -> None:
+        """Note a first message that is refused before anything is registered; `name` is who sent it, if known."""
+        self._core.refuse(refusal)
+        if name is not None:
+            self._tell_refused(name, refusal, details)
+
+    def _tell_refused(self, name: NodeName, refusal: Refusal, details: str) -> None:
+        self.events.record_refusal(name, refusal.name, f"registration: {details}")
 
     async def prepare(self, message: SidecarMessage) -> None:
         """Look up in turns what the policy says of services not heard of before, ahead of `receive`."""
@@ -284,9 +299,12 @@ class ControlLoop:
         counts = Counter(sidecar.role for sidecar in self._core.registry)
         return f"sidecars connected: {counts[Role.ROBOT]} of robots, {counts[Role.CLOUD]} of clouds"
 
-    def explain(self, robot: NodeName, service: ServiceName) -> Explanation:
-        """Explain why requests go where they go; raises UnknownNameError if the robot or its service is unknown."""
-        return self._core.explain(robot, service, self._loop.time())
+    def explain(self, robot: NodeName, service: ServiceName) -> tuple[Explanation, Pairs]:
+        """Explain why requests go where they go; raises UnknownNameError if the robot or its service is unknown.
+
+        Return the explanation without its pairs, and these, to be read in turns.
+        """
+        return self._core.explain_in_parts(robot, service, self._loop.time)
 
     async def set_policy(self, policy: Policy | None) -> None:
         """Put another policy into force, once it is applied to all members: in turns, as there may be many rules."""
@@ -337,6 +355,12 @@ class ControlLoop:
                     self._callers.pop(name, None)
                 case StreamLostNotice(sidecar=name, role=role) if not self._closing:
                     self.events.record(EventKind.STREAM_LOST, name, role=role)
+                case FaultNotice(sidecar=name, found=found, over=over):
+                    kind = EventKind.RECOVERED if over else _FAULT_EVENTS[found.fault]
+                    what = f" is no longer {found.fault.value}" if over else f": {found.text}"
+                    text = f"{found.interface}{what}"
+                    self._say(logging.INFO if over else logging.WARNING, name, "%s: %s: %s", name, kind.value, text)
+                    self._record(kind, name, text)
                 case CutOffNotice(sidecar=name, role=role, lifted=lifted):
                     self._say(
                         logging.INFO if lifted else logging.WARNING,
@@ -390,7 +414,7 @@ class ControlLoop:
 
     def refused_member(self, name: NodeName, error: CertificateError) -> None:
         """Record that a member's connection was refused."""
-        self.events.record(EventKind.REFUSED, name, f"connection: {error}")
+        self.events.record_refusal(name, error.reason, f"connection: {error}")
         why = Why.REVOKED if error.reason == REVOKED else Why.CERTIFICATE_EXPIRED
         if error.reason in {REVOKED, EXPIRED, NOT_YET_VALID}:
             self._core.note_refused(name, why, str(error))

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 from plr.controlplane.cli.text_table import columns
 from plr.protos.model.explanation import AlternativeKind, Correlation
+from plr.protos.model.redundancy_mode import RedundancyMode
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
@@ -23,6 +24,17 @@ MAX_LIVE = 8
 
 LITTLE_GAIN = 0.5
 """If the other interface misses at least this share of what the better one misses, it gains little."""
+
+_SENDING = {
+    RedundancyMode.SINGLE: "each request goes over one of them, and over another one if its path or server fails",
+    RedundancyMode.BACKUP: "each request goes over one of them, and over the next one if that copy is lost or silent",
+    RedundancyMode.HEDGE: "each request goes over one of them, and over the next one if the answer is unusually late",
+    RedundancyMode.ADAPTIVE: "each request goes over one of them, and over others as late as the allowed misses permit",
+    RedundancyMode.SHARE: "a large request goes once, to one server, in parts over all their interfaces; "
+    "a small one goes over all of them",
+    RedundancyMode.REPLICATE: "each request goes over all of them at once",
+}
+"""What a robot does with the pairs of a mapping, by the service's redundancy mode."""
 
 _PAIR_HEADER = (
     *("", "INTERFACE", "SERVER", "STATE", "MISS", "90 % BETWEEN", "REQUESTS", "PROBES"),
@@ -68,6 +80,8 @@ def _mapping(found: Explanation) -> Iterator[str]:
     observed = f"recently observed {_probability(found.observed_miss)}" if found.observed_miss is not None else ""
     if found.mapping.assignments:
         yield _paths(found.mapping.assignments)
+        if found.redundancy is not None:
+            yield f"redundancy {found.redundancy.value}: {_SENDING[found.redundancy]}"
         cost = f"a request costs {found.cost_per_request:g}" if found.cost_per_request is not None else ""
         predicted = found.mapping.predicted_miss if found.predicted_miss is None else found.predicted_miss
         misses = [f"predicted miss {_probability(predicted)}", observed, cost]

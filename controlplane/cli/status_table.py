@@ -100,6 +100,8 @@ def _details(status: SidecarStatus) -> Iterator[tuple[str, bool]]:
             yield f"{use.name}: fallback {state}", not use.fallback_up
     lines = columns([_path(path) for path in status.paths])
     yield from ((line, not path.up) for line, path in zip(lines, status.paths, strict=True))
+    for one in status.faults:
+        yield f"{one.interface} {one.fault.value.upper()}: {one.text}", True
     for interface in status.down:
         yield f"{interface} DOWN: the sidecar would use it, but it is missing or has no link or no address", True
 

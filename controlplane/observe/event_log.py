@@ -22,6 +22,7 @@ from collections import deque
 from typing import IO, TYPE_CHECKING, NamedTuple
 
 from plr.controlplane.core.explain.event_memory import EventMemory
+from plr.controlplane.core.overload.refusal_share import RefusalShare
 from plr.controlplane.observe.event_lines import decode, encode
 from plr.protos.base.errors import DecodeError
 from plr.protos.model.fleet_events import EventKind, EventLogState, FleetEvent
@@ -90,6 +91,7 @@ class EventLog:
         self._clock = clock
         self._retry_s = retry_s
         self._memory = EventMemory()
+        self._refusals = RefusalShare()
         self._suppressed: dict[NodeName, int] = {}
         self._held: dict[NodeName, _Said] = {}
         """The last event of a member that says whether it is present, if that exceeds its share."""
@@ -148,6 +150,18 @@ class EventLog:
         if node in self._suppressed or len(self._suppressed) < MAX_UNWRITTEN:
             self._suppressed[node] = self._suppressed.get(node, 0) + 1
 
+    def record_refusal(self, node: NodeName, reason: str, text: str) -> None:
+        """Record that a sidecar of this name was refused, now and then and not each time.
+
+        This takes nothing of the share of a member of that name: it may be somebody else who uses the name.
+        """
+        left_out = self._refusals.take(node, reason, self._clock())
+        if left_out is None:
+            return
+        if left_out:
+            text = f"{text} (and {left_out} earlier times that were too many to keep)"
+        self._add(_Said(self._wall(), EventKind.REFUSED, text, None, None, None), node)
+
     def keep_held(self) -> None:
         """Record the last change of presence of members that had more than their share, once there is room for it."""
         now = self._clock()
@@ -166,11 +180,13 @@ class EventLog:
         text = said.text
         if node is not None and (more := self._suppressed.pop(node, 0)):
             text = f"{text} (and {more} earlier events that were too many to keep)"
+        self._add(said._replace(text=text), node)
+
+    def _add(self, said: _Said, node: NodeName | None) -> None:
         # Numbers grow even after the log was lost: a client that asks for new events must not wait for a catch-up.
         number = max(self._memory.last_number + 1, int(self._wall() * 1e6))
-        event = FleetEvent(
-            number, said.at, said.kind, node, clean_text(text.strip()), said.role, said.why, said.seen_at
-        )
+        text = clean_text(said.text.strip())
+        event = FleetEvent(number, said.at, said.kind, node, text, said.role, said.why, said.seen_at)
         with self._condition:
             self._memory.add(event)
             if self._writer is None:
@@ -207,7 +223,7 @@ class EventLog:
         return EventLogState(
             kept=len(self._memory),
             evicted=self._memory.evicted,
-            too_often=self._too_often,
+            too_often=self._too_often + self._refusals.left_out,
             damaged=self._damaged,
             write_failures=self._write_failures,
             on_disk=self._writer is not None and not self._problem,

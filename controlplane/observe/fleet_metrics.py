@@ -20,6 +20,7 @@ from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, InfoM
 from prometheus_client.samples import Sample
 
 from plr.protos.model.ids import Role
+from plr.protos.model.status import Fault
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
@@ -33,7 +34,7 @@ if TYPE_CHECKING:
 MAX_SERIES = 100_000
 """Most series of all members."""
 
-SERIES_OF_MEMBER = 6
+SERIES_OF_MEMBER = 7
 """Most series of a member, present or gone, besides a robot's own and a server's by service: a server has this many."""
 
 MAX_SERIES_OF_SERVICES = 20_000
@@ -41,6 +42,9 @@ MAX_SERIES_OF_SERVICES = 20_000
 
 MAX_GONE_WITH_SERIES = 1024
 """Departed members that still have series, the last to go."""
+
+SERIES_OF_INTERFACE = 3 + len(Fault)
+"""Series of one interface of a robot, besides those of its paths."""
 
 REUSED_S = 1.0
 """Scrapes within this interval share their values."""
@@ -142,7 +146,7 @@ def _room(robot: MemberView, share: int) -> _Room:
         2 * len(robot.misses),
         sum((miss.predicted is not None) + (miss.observed is not None) + (miss.target > 0.0) for miss in robot.misses),
         len(robot.paths),
-        2 * len(robot.interfaces),
+        SERIES_OF_INTERFACE * len(robot.interfaces),
         sum(len(mapping.assignments) for mapping in robot.mapping),
         len(robot.paths),
     )
@@ -156,7 +160,7 @@ def _room(robot: MemberView, share: int) -> _Room:
         counted=given[1] // 2,
         misses=given[2],
         paths=given[3],
-        interfaces=given[4] // 2,
+        interfaces=given[4] // SERIES_OF_INTERFACE,
         mapped=given[5],
         round_trips=given[6],
         left_out=sum(wanted) - sum(given),
@@ -227,14 +231,18 @@ def _servers(fleet: Fleet) -> Metric:
                 counts.update((server, "never") for server in robot.unproven)
                 doubted.update(robot.doubted)
                 counts.update((server, "lost") for server in robot.lost)
+                counts.update((server, "restless") for server in robot.restless)
         # One robot that has reached a server proves nothing against two that doubt it.
         counts.update({(server, "never"): count for server, count in doubted.items() if count > 1})
         for member in fleet.members:
             if member.role is Role.CLOUD:
-                for path in ("up", "lost", "never"):
+                for path in ("up", "lost", "never", "restless"):
                     yield (member.name, path), float(counts[member.name, path])
 
-    text = "Robots that reach the server (up), or reach only others: lost if they reached it before, never if none did."
+    text = (
+        "Robots that reach the server (up), or reach only others: lost if they reached it before, never if none did; "
+        "restless: to this server alone, their paths over several interfaces go up and down."
+    )
     return _gauge("plr_server_robots", text, ("server", "path"), reach)
 
 
@@ -308,6 +316,17 @@ def _robots(rooms: Sequence[tuple[MemberView, _Room]]) -> Iterator[Metric]:
             for interface in robot.interfaces[: room.interfaces]:
                 yield (robot.name, interface.name), float(interface.up)
 
+    def changes() -> Iterator[tuple[Labels, float]]:
+        for robot, room in rooms:
+            for interface in robot.interfaces[: room.interfaces]:
+                yield (robot.name, interface.name), float(interface.changes)
+
+    def faults() -> Iterator[tuple[Labels, float]]:
+        for robot, room in rooms:
+            for interface in robot.interfaces[: room.interfaces]:
+                for fault in Fault:
+                    yield (robot.name, interface.name, fault.value), float(fault in interface.faults)
+
     def servers() -> Iterator[tuple[Labels, float]]:
         yield from (((robot.name,), float(robot.servers)) for robot, _ in rooms)
 
@@ -375,6 +394,18 @@ def _robots(rooms: Sequence[tuple[MemberView, _Room]]) -> Iterator[Metric]:
         "1 while the robot's interface carries something, 0 while the robot would use it but it carries nothing.",
         ("robot", "interface"),
         carrying,
+    )
+    yield _counter(
+        "plr_robot_interface_changes_total",
+        "Times that the robot's interface, or a path over it, went up or down.",
+        ("robot", "interface"),
+        changes,
+    )
+    yield _gauge(
+        "plr_robot_interface_fault",
+        "1 while the robot's interface is up, but is flapping or useless, which another interface makes up for.",
+        ("robot", "interface", "fault"),
+        faults,
     )
     yield _gauge(
         "plr_robot_mapping_synced", "1 while the robot has confirmed the mapping sent last.", ("robot",), follows

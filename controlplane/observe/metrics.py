@@ -285,6 +285,7 @@ def _drops(core: ControlCore, superseded: int, dropped: Mapping[str, int], event
             ("departure_forgotten",): core.departed.forgotten,
             ("reach_forgotten",): core.reached.forgotten,
             ("unanswered_forgotten",): core.unanswered.forgotten,
+            ("interface_unwatched",): core.faults.left_out,
             ("event_evicted",): events.evicted,
             ("event_too_often",): events.too_often,
             ("event_damaged",): events.damaged,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import inspect
 import time
 from dataclasses import dataclass
@@ -42,6 +43,20 @@ CALLS_BURST = 100.0
 
 LONGEST_WAIT_S = 10.0
 """A call that would have to wait for longer is refused, after this time."""
+
+FIRST_WORDS_S = 2.0
+"""Longest wait for the first message of a call that is refused: it follows the call's headers at once."""
+
+
+async def first_words(context: Any) -> None:
+    """Wait for the first message of a call that sends a stream, before the call is refused.
+
+    A client that still writes when the refusal arrives may see INTERNAL: its failed write hides the status of the
+    refusal (gRPC for Python, `grpc.aio`). A client that says nothing is refused after FIRST_WORDS_S.
+    """
+    with contextlib.suppress(TimeoutError, grpc.aio.BaseError):
+        async with asyncio.timeout(FIRST_WORDS_S):
+            await context.read()
 
 
 @dataclass(slots=True)
@@ -86,18 +101,23 @@ class AccessGuard(grpc.aio.ServerInterceptor):
         if handler is None:
             return handler
         service = str(handler_call_details.method).rpartition("/")[0].removeprefix("/")
-        return _wrap(handler, lambda context: self._admit(service, context))
+        sends_stream = bool(handler.request_streaming)
+        return _wrap(handler, lambda context: self._admit(service, context, sends_stream=sends_stream))
 
-    async def _admit(self, service: str, context: Any) -> None:
+    async def _admit(self, service: str, context: Any, *, sends_stream: bool) -> None:
         """Abort the call (which raises) unless its caller may make it."""
         caller = self._caller(context.peer())
         if caller is None:
             await context.abort(grpc.StatusCode.UNAUTHENTICATED, "the connection has ended")
         elif caller.refusal is not None:
+            if sends_stream:
+                await first_words(context)
             text = with_remedy(caller.refusal, caller.identity.name)
             await context.abort(grpc.StatusCode.UNAUTHENTICATED, text)
         elif caller.identity.role not in _ALLOWED.get(service, frozenset()):
             self._on_refused(WRONG_ROLE)
+            if sends_stream:
+                await first_words(context)
             name, role = caller.identity.name, caller.identity.role.value
             await context.abort(
                 grpc.StatusCode.PERMISSION_DENIED,

@@ -20,6 +20,7 @@ from plr.protos.convert import (
     explain_request_from_proto,
     explanation_to_proto,
     log_state_to_proto,
+    pairs_to_proto,
     status_query_from_proto,
     status_to_proto,
 )
@@ -30,6 +31,7 @@ if TYPE_CHECKING:
     from collections.abc import AsyncIterator
 
     from plr.controlplane.loop import ControlLoop
+    from plr.protos.model.explanation import PairExplanation
 
 SERVICE_NAME = admin_pb2.DESCRIPTOR.services_by_name["Admin"].full_name
 
@@ -61,9 +63,7 @@ class AdminService:
             "StreamStatus": grpc.unary_stream_rpc_method_handler(
                 self.stream_status, admin_pb2.StreamStatusRequest.FromString
             ),
-            "Explain": grpc.unary_unary_rpc_method_handler(
-                self.explain, admin_pb2.ExplainRequest.FromString, admin_pb2.ExplainResponse.SerializeToString
-            ),
+            "Explain": grpc.unary_unary_rpc_method_handler(self.explain, admin_pb2.ExplainRequest.FromString),
             "ListEvents": grpc.unary_unary_rpc_method_handler(self.list_events, admin_pb2.ListEventsRequest.FromString),
         }
         server.add_generic_rpc_handlers((grpc.method_handlers_generic_handler(SERVICE_NAME, handlers),))
@@ -102,15 +102,19 @@ class AdminService:
         async for found in loop.turns.each(names, partial(loop.status, abridged=abridged), STATUS_TURNS):
             yield b"".join(found)
 
-    async def explain(self, request: admin_pb2.ExplainRequest, context: Any) -> admin_pb2.ExplainResponse:
+    async def explain(self, request: admin_pb2.ExplainRequest, context: Any) -> bytes:
         """Explain why a robot's requests for a service go where they go."""
         try:
             robot, service = explain_request_from_proto(request)
-            return explanation_to_proto(self._loop.explain(robot, service))
+            head, pairs = self._loop.explain(robot, service)
         except DecodeError as error:
             await _abort(context, grpc.StatusCode.INVALID_ARGUMENT, str(error))
         except UnknownNameError as error:
             await _abort(context, grpc.StatusCode.NOT_FOUND, str(error))
+        answer = bytearray(explanation_to_proto(head).SerializeToString())
+        async for parts in self._loop.turns.each(pairs, _encoded_pair):
+            answer += b"".join(parts)
+        return bytes(answer)
 
     async def list_events(self, request: admin_pb2.ListEventsRequest, context: Any) -> bytes:
         """Return what happened in the fleet."""
@@ -124,6 +128,11 @@ class AdminService:
         async for events in self._loop.turns.each(found, event_to_proto):
             answer += admin_pb2.ListEventsResponse(events=events).SerializeToString()
         return bytes(answer)
+
+
+def _encoded_pair(pair: PairExplanation | None) -> bytes:
+    """Return a pair as an encoded part of an ExplainResponse."""
+    return b"" if pair is None else pairs_to_proto((pair,)).SerializeToString()
 
 
 async def _abort(context: Any, code: grpc.StatusCode, text: str) -> NoReturn:

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import asyncio
 import time
-from typing import TYPE_CHECKING, NoReturn
+from typing import TYPE_CHECKING, NamedTuple, NoReturn
 
 import grpc
 
 from plr.controlplane.core.publish.messages import CloseReason
 from plr.controlplane.core.registry.registry import Refusal
+from plr.controlplane.serve.access import first_words
 from plr.controlplane.serve.stream_encoder import StreamEncoder
 from plr.controlplane.serve.stream_limits import (
     MAX_FIRST_BYTES,
@@ -29,6 +30,7 @@ from plr.protos.convert import (
 )
 from plr.protos.convert.reports import report_entries
 from plr.protos.model.members import Registration
+from plr.protos.model.names import node_name
 from plr.protos.model.protocol_versions import Spoken, refusal
 from plr.protos.model.report import Report
 from plr.protos.model.stream import Heartbeat
@@ -67,6 +69,8 @@ _REFUSAL_CODES = {
     Refusal.NAME_MISMATCH: grpc.StatusCode.PERMISSION_DENIED,
     Refusal.WRONG_ROLE: grpc.StatusCode.PERMISSION_DENIED,
     Refusal.BAD_CREDENTIAL: grpc.StatusCode.PERMISSION_DENIED,
+    Refusal.VERSION: grpc.StatusCode.FAILED_PRECONDITION,
+    Refusal.MALFORMED: grpc.StatusCode.INVALID_ARGUMENT,
 }
 
 _CLOSE_CODES = {
@@ -78,7 +82,20 @@ _CLOSE_CODES = {
 }
 
 
-_NOT_A_REGISTRATION = (grpc.StatusCode.INVALID_ARGUMENT, "the first message has to be a registration")
+class _NoRegistration(NamedTuple):
+    """Why a first message is refused."""
+
+    refusal: Refusal
+    details: str
+    claimed: NodeName | None = None
+    """Who sent it, if it says so."""
+
+    @property
+    def code(self) -> grpc.StatusCode:
+        return _REFUSAL_CODES[self.refusal]
+
+
+_NOT_A_REGISTRATION = _NoRegistration(Refusal.MALFORMED, "the first message has to be a registration")
 
 
 class _StreamEndError(Exception):
@@ -116,11 +133,12 @@ class ControlPlaneService:
         """Serve one stream until either side ends it."""
         who = context.peer()
         try:
-            caller = self._caller_of(context)
+            caller = await self._caller_of(context)
             if caller is not None:
                 who = caller.identity.name
             if not self._streams.enter(who):
                 self._loop.refused(TOO_MANY_STREAMS)
+                await first_words(context)
                 raise _StreamEndError(
                     grpc.StatusCode.RESOURCE_EXHAUSTED, f"{who} has {MAX_STREAMS_PER_NAME} streams open"
                 )
@@ -162,7 +180,8 @@ class ControlPlaneService:
         except TimeoutError:
             raise _StreamEndError(grpc.StatusCode.DEADLINE_EXCEEDED, "no registration arrived") from None
         if not isinstance(found, Registration):
-            raise _StreamEndError(*found)
+            self._loop.refuse(found.claimed if caller is None else caller.identity.name, found.refusal, found.details)
+            raise _StreamEndError(found.code, found.details)
         registration = found
         async with self._turn:
             # Register few in each turn of the loop: messages of registered members come in between.
@@ -172,13 +191,16 @@ class ControlPlaneService:
             raise _StreamEndError(_REFUSAL_CODES[result], f"{registration.name}: {result.value}")
         return registration.name, *result, registration.incremental
 
-    def _caller_of(self, context: Context) -> Caller | None:
+    async def _caller_of(self, context: Context) -> Caller | None:
         if self._gate is None:
             return None
         caller = self._gate.caller(context.peer())
         # The guard saw a caller a moment ago; a connection that has ended since must not count as insecure mode.
-        if caller is None or caller.refusal is not None:
+        if caller is None:
             raise _StreamEndError(grpc.StatusCode.UNAUTHENTICATED, "the connection has ended")
+        if caller.refusal is not None:
+            await first_words(context)
+            raise _StreamEndError(grpc.StatusCode.UNAUTHENTICATED, str(caller.refusal))
         return caller
 
     @staticmethod
@@ -263,7 +285,7 @@ def _only_end(group: BaseExceptionGroup) -> _End | None:
     return first.code, first.details
 
 
-def _first_message(data: bytes) -> Registration | _End:
+def _first_message(data: bytes) -> Registration | _NoRegistration:
     """Return the registration that a stream begins with, or why it ends."""
     if len(data) > MAX_FIRST_BYTES:
         return _NOT_A_REGISTRATION
@@ -275,10 +297,17 @@ def _first_message(data: bytes) -> Registration | _End:
             oldest = message.register.protocol_version
             problem = refusal(Spoken(oldest, message.register.newest_protocol_version or oldest))
             if problem is not None:
-                return grpc.StatusCode.FAILED_PRECONDITION, problem
+                return _NoRegistration(Refusal.VERSION, problem, _claimed_name(message.register.name))
         elif kind is not None:
             return _NOT_A_REGISTRATION
         registration = sidecar_message_from_proto(message)
     except DecodeError as error:
-        return grpc.StatusCode.INVALID_ARGUMENT, str(error)
+        return _NoRegistration(Refusal.MALFORMED, str(error))
     return registration if isinstance(registration, Registration) else _NOT_A_REGISTRATION
+
+
+def _claimed_name(name: str) -> NodeName | None:
+    try:
+        return node_name(name, "name")
+    except DecodeError:
+        return None

@@ -36,7 +36,12 @@ from plr.protos.convert.events import (
     log_state_from_proto,
     log_state_to_proto,
 )
-from plr.protos.convert.explanation import explain_request_from_proto, explanation_from_proto, explanation_to_proto
+from plr.protos.convert.explanation import (
+    explain_request_from_proto,
+    explanation_from_proto,
+    explanation_to_proto,
+    pairs_to_proto,
+)
 from plr.protos.convert.mapping import mapping_set_from_proto, mapping_set_to_proto
 from plr.protos.convert.reports import report_from_proto, report_to_proto
 from plr.protos.convert.types import (
@@ -80,6 +85,7 @@ __all__ = [
     "offer_from_proto",
     "offer_to_proto",
     "own_revocations_from_proto",
+    "pairs_to_proto",
     "parse_control_message",
     "parse_in_parts",
     "parse_sidecar_message",

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 from plr.protos.base.errors import DecodeError
 from plr.protos.convert.control import revocations_from_proto, revocations_to_proto
 from plr.protos.convert.fields import (
+    MAX_CANDIDATES,
     MAX_LISTED_SIDECARS,
     MAX_MAPPED_SERVICES,
     MAX_OFFERS,
@@ -30,9 +31,9 @@ from plr.protos.convert.types import (
     use_to_proto,
 )
 from plr.protos.model.members import MAX_UNMET, NO_REVOCATIONS, RevocationSet
-from plr.protos.model.names import clean_text, node_name, text
+from plr.protos.model.names import clean_text, interface_name, node_name, text
 from plr.protos.model.report import MAX_PATH_REPORTS
-from plr.protos.model.status import ResourceStatus, SidecarStatus, StatusQuery, SyncState
+from plr.protos.model.status import Fault, InterfaceFault, ResourceStatus, SidecarStatus, StatusQuery, SyncState
 from plr.protos.plr.v1 import admin_pb2
 
 if TYPE_CHECKING:
@@ -47,6 +48,11 @@ _SYNC_STATES = {
     admin_pb2.SYNC_STATE_REJECTED: SyncState.REJECTED,
 }
 _SYNC_STATE_NUMBERS = {state: number for number, state in _SYNC_STATES.items()}
+_FAULTS = {admin_pb2.FAULT_FLAPPING: Fault.FLAPPING, admin_pb2.FAULT_USELESS: Fault.USELESS}
+_FAULT_NUMBERS = {fault: number for number, fault in _FAULTS.items()}
+
+MAX_FAULTS = len(Fault) * MAX_CANDIDATES
+"""Faults of the interfaces of one sidecar."""
 
 
 def status_from_proto(message: admin_pb2.GetStatusResponse) -> tuple[SidecarStatus, ...]:
@@ -96,6 +102,7 @@ def _sidecar_from_proto(message: admin_pb2.SidecarStatus) -> SidecarStatus:
         untyped=service_names(message.untyped, MAX_UNMET, "untyped"),
         unreached=service_names(message.unreached, MAX_UNMET, "unreached"),
         down=interface_names(message.down, "down"),
+        faults=each(message.faults, MAX_FAULTS, "faults", _fault_from_proto),
         withdrawn=service_names(message.withdrawn, MAX_OFFERS, "withdrawn"),
         unanswered=_unanswered_from_proto(message.unanswered),
         abridged=message.abridged,
@@ -119,12 +126,27 @@ def _sidecar_to_proto(status: SidecarStatus) -> admin_pb2.SidecarStatus:
         untyped=status.untyped,
         unreached=status.unreached,
         down=status.down,
+        faults=map(_fault_to_proto, status.faults),
         withdrawn=status.withdrawn,
         unanswered=(
             admin_pb2.UnansweredService(service=service, requests=requests)
             for service, requests in status.unanswered.items()
         ),
         abridged=status.abridged,
+    )
+
+
+def _fault_from_proto(message: admin_pb2.InterfaceFault) -> InterfaceFault:
+    return InterfaceFault(
+        interface=interface_name(message.interface, "interface"),
+        fault=known(message.fault, _FAULTS, "fault"),
+        text=text(message.text, "text"),
+    )
+
+
+def _fault_to_proto(found: InterfaceFault) -> admin_pb2.InterfaceFault:
+    return admin_pb2.InterfaceFault(
+        interface=found.interface, fault=_FAULT_NUMBERS[found.fault], text=clean_text(found.text)
     )
 
 

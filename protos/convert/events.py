@@ -59,6 +59,9 @@ _KINDS = {
     admin_pb2.EVENT_KIND_POLICY: EventKind.POLICY,
     admin_pb2.EVENT_KIND_CUT_OFF: EventKind.CUT_OFF,
     admin_pb2.EVENT_KIND_REJOINED: EventKind.REJOINED,
+    admin_pb2.EVENT_KIND_FLAPPING: EventKind.FLAPPING,
+    admin_pb2.EVENT_KIND_USELESS: EventKind.USELESS,
+    admin_pb2.EVENT_KIND_RECOVERED: EventKind.RECOVERED,
 }
 _KIND_NUMBERS = {kind: number for number, kind in _KINDS.items()}
 

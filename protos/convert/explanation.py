@@ -27,7 +27,12 @@ from plr.protos.convert.mapping import (
     service_mapping_from_proto,
     service_mapping_to_proto,
 )
-from plr.protos.convert.types import histogram_from_proto, histogram_to_proto
+from plr.protos.convert.types import (
+    histogram_from_proto,
+    histogram_to_proto,
+    redundancy_from_proto,
+    redundancy_to_proto,
+)
 from plr.protos.model.explanation import (
     Alternative,
     AlternativeKind,
@@ -43,6 +48,8 @@ from plr.protos.model.report import MAX_JOINTS
 from plr.protos.plr.v1 import admin_pb2
 
 if TYPE_CHECKING:
+    from collections.abc import Iterable
+
     from plr.protos.model.ids import NodeName, ServiceName
 
 MAX_LISTED_PAIRS = 4096
@@ -102,6 +109,7 @@ def explanation_from_proto(message: admin_pb2.ExplainResponse) -> Explanation:
         joints=each(message.joints, MAX_JOINTS, "joints", _joint_from_proto),
         alternatives=each(message.alternatives, MAX_ALTERNATIVES, "alternatives", _alternative_from_proto),
         changes=each(message.changes, MAX_LISTED_CHANGES, "changes", _change_from_proto),
+        redundancy=redundancy_from_proto(message.redundancy) if message.HasField("redundancy") else None,
         gone_s=_age(message.gone_us, "gone_us") if message.HasField("gone_us") else None,
         gone_why=why_from_proto(message.gone_reason) if message.HasField("gone_us") else None,
     )
@@ -128,9 +136,15 @@ def explanation_to_proto(explanation: Explanation) -> admin_pb2.ExplainResponse:
         joints=map(_joint_to_proto, found.joints),
         alternatives=map(_alternative_to_proto, found.alternatives),
         changes=map(_change_to_proto, found.changes),
+        redundancy=redundancy_to_proto(found.redundancy) if found.redundancy is not None else None,
         gone_us=microseconds(found.gone_s) if found.gone_s is not None else None,
         gone_reason=why_to_proto(found.gone_why),
     )
+
+
+def pairs_to_proto(pairs: Iterable[PairExplanation]) -> admin_pb2.ExplainResponse:
+    """Encode pairs as a part of an explanation that has none of its own."""
+    return admin_pb2.ExplainResponse(pairs=map(_pair_to_proto, pairs))
 
 
 def _optional(message: admin_pb2.ExplainResponse, field: Literal["observed_miss", "predicted_miss"]) -> float | None:

@@ -69,6 +69,16 @@ _CANDIDATE_KINDS = {
 _CANDIDATE_KIND_NUMBERS = {kind: number for number, kind in _CANDIDATE_KINDS.items()}
 
 
+def redundancy_from_proto(value: types_pb2.RedundancyMode.ValueType) -> RedundancyMode:
+    """Return a mode; for one of a later version the one that promises least: only predictions depend on it."""
+    return _REDUNDANCY_MODES.get(value, RedundancyMode.SINGLE)
+
+
+def redundancy_to_proto(mode: RedundancyMode) -> types_pb2.RedundancyMode.ValueType:
+    """Encode a mode."""
+    return _REDUNDANCY_NUMBERS[mode]
+
+
 def role_from_proto(value: types_pb2.Role.ValueType) -> Role:
     """Check a role."""
     return known(value, _ROLES, "role")
@@ -212,8 +222,7 @@ def use_from_proto(message: types_pb2.ServiceUse) -> ServiceUse:
         copies=_copies_from_proto(message),
         target_miss=_target(message.target_miss),
         fallback_up=message.fallback_up if message.has_fallback else None,
-        # For a mode of a later version, assume the one that promises least: only the prediction depends on it.
-        redundancy=_REDUNDANCY_MODES.get(message.redundancy, RedundancyMode.SINGLE),
+        redundancy=redundancy_from_proto(message.redundancy),
         hedge_quantile=probability(message.hedge_quantile, "hedge_quantile") or DEFAULT_HEDGE_QUANTILE,
         budgeted=message.budgeted,
         wanted_miss=probability(message.wanted_miss, "wanted_miss"),
@@ -245,7 +254,7 @@ def use_to_proto(use: ServiceUse) -> types_pb2.ServiceUse:
         target_miss=use.target_miss,
         has_fallback=use.fallback_up is not None,
         fallback_up=bool(use.fallback_up),
-        redundancy=_REDUNDANCY_NUMBERS[use.redundancy],
+        redundancy=redundancy_to_proto(use.redundancy),
         hedge_quantile=use.hedge_quantile,
         budgeted=use.budgeted,
         wanted_miss=use.wanted_miss,

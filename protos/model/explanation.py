@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from plr.protos.model.fleet_events import Why
     from plr.protos.model.ids import InterfaceName, NodeName, ServiceName, Version
     from plr.protos.model.mapping import Assignment, ServiceMapping
+    from plr.protos.model.redundancy_mode import RedundancyMode
     from plr.protos.model.status import ResourceStatus
 
 SAMPLE = 1000
@@ -168,6 +169,8 @@ class Explanation:
     alternatives: tuple[Alternative, ...] = ()
     changes: tuple[MappingChange, ...] = ()
     """The last mappings sent, newest first."""
+    redundancy: RedundancyMode | None = None
+    """How the robot sends copies of a request over the mapped pairs; None if the control plane does not say so."""
     gone_s: float | None = None
     """How long the robot has been gone; everything else is then as last known. None if it is not gone."""
     gone_why: Why | None = None

@@ -50,6 +50,12 @@ class EventKind(enum.Enum):
     """The policy lets it talk to nobody."""
     REJOINED = "rejoined"
     """The policy lets it talk to others again."""
+    FLAPPING = "flapping"
+    """Paths over one of its interfaces go up and down all the time."""
+    USELESS = "useless"
+    """One of its interfaces is up, but delivers nothing in time or loses most."""
+    RECOVERED = "recovered"
+    """One of its interfaces is neither any more."""
 
 
 @dataclass(frozen=True, slots=True)

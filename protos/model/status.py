@@ -42,6 +42,25 @@ class ResourceStatus:
     error: str = ""
 
 
+class Fault(enum.Enum):
+    """What is wrong with an interface that another one of the robot makes up for."""
+
+    FLAPPING = "flapping"
+    """A path over it goes up and down all the time."""
+    USELESS = "useless"
+    """A path over it is up, but nothing arrives in time, or most is lost."""
+
+
+@dataclass(frozen=True, slots=True)
+class InterfaceFault:
+    """What is wrong with one interface of a robot."""
+
+    interface: InterfaceName
+    fault: Fault
+    text: str
+    """Details, for people."""
+
+
 @dataclass(frozen=True, slots=True)
 class StatusQuery:
     """Whose status to return (everybody's if no name is given), and how many of those in order to describe in full.
@@ -77,6 +96,8 @@ class SidecarStatus:
     """Services that its configuration names and known servers offer, none of which it reaches."""
     down: tuple[InterfaceName, ...] = ()
     """Interfaces that it would use but that carry nothing now."""
+    faults: tuple[InterfaceFault, ...] = ()
+    """What is wrong with its other interfaces."""
     withdrawn: tuple[ServiceName, ...] = ()
     """Services that it has offered since it registered, no longer offers, and its configuration does not name."""
     unanswered: Mapping[ServiceName, int] = field(default_factory=dict)

@@ -23,7 +23,7 @@ from plr.protos.model.ids import InterfaceName, NodeName, Role
 from plr.protos.model.members import CandidateSet, ServiceSet
 from plr.protos.model.report import PathReport, Report
 from plr.protos.plr.v1 import admin_pb2, admin_pb2_grpc
-from tests.support.samples import histogram, interfaces, offer, registration, use
+from tests.support.samples import PLAN, histogram, interfaces, offer, registration, use
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable
@@ -160,6 +160,29 @@ def test_events_come_in_one_message_made_in_turns(monkeypatch: pytest.MonkeyPatc
         assert [event.number for event in answer.events] == kept[-70:]
         assert answer.left_out == len(kept) - 70
         assert answer.log.kept == len(kept)
+
+    serve(ask)
+
+
+def test_an_explanation_comes_in_one_message_made_in_turns(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(turns, "TURN_S", 0.0)
+
+    async def ask(stub: admin_pb2_grpc.AdminAsyncStub, loop: ControlLoop) -> None:
+        granted = 0
+        real = turns._one_turn
+
+        def one_turn(*given: Any) -> Any:
+            nonlocal granted
+            granted += 1
+            return real(*given)
+
+        monkeypatch.setattr(turns, "_one_turn", one_turn)
+        answer = await stub.Explain(admin_pb2.ExplainRequest(robot=BAD, service=PLAN))
+        assert (answer.robot, answer.service) == (BAD, PLAN)
+        assert granted > len(answer.pairs)
+        with pytest.raises(grpc.aio.AioRpcError) as caught:
+            await stub.Explain(admin_pb2.ExplainRequest(robot="nobody", service=PLAN))
+        assert caught.value.code() is grpc.StatusCode.NOT_FOUND
 
     serve(ask)
 

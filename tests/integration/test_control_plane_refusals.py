@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import random
+import re
+import time
+import urllib.request
 from dataclasses import replace
 
 import grpc
@@ -11,8 +14,15 @@ import pytest
 from plr.protos.convert import sidecar_message_to_proto
 from plr.protos.model.ids import PROTOCOL_VERSION, Role
 from plr.protos.model.stream import Welcome
-from plr.protos.plr.v1 import control_pb2
-from tests.support.control_plane_process import PATIENCE_S, ControlPlaneProcess, Sidecar, Stream, cloud
+from plr.protos.plr.v1 import admin_pb2, admin_pb2_grpc, control_pb2
+from tests.support.control_plane_process import (
+    PATIENCE_S,
+    ControlPlaneProcess,
+    Sidecar,
+    Stream,
+    cloud,
+    open_channel,
+)
 from tests.support.samples import registration
 
 
@@ -63,6 +73,31 @@ def test_bad_registrations_get_a_clear_status(
         found, text = stream.end()
         assert found is code
         assert details in text
+
+
+def test_a_refused_version_is_counted_and_told_by_name_once_a_minute(alone: ControlPlaneProcess) -> None:
+    def count(reason: str) -> int:
+        with urllib.request.urlopen(f"http://{alone.metrics}/metrics", timeout=PATIENCE_S) as answer:
+            found = re.search(rf'plr_registrations_refused_total{{reason="{reason}"}} (\d+)', answer.read().decode())
+        assert found is not None
+        return int(found[1])
+
+    for _ in range(3):
+        with Stream(alone.address) as stream:
+            stream.send_raw(raw_register(protocol_version=98, newest_protocol_version=99, name="robot-9"))
+            stream.end()
+    with Stream(alone.address) as stream:
+        stream.send_raw(control_pb2.SidecarMessage())
+        stream.end()
+    end = time.monotonic() + PATIENCE_S
+    while (count("version"), count("malformed")) != (3, 1):
+        assert time.monotonic() < end
+        time.sleep(0.1)
+    with open_channel(alone.address, None) as channel:
+        events = admin_pb2_grpc.AdminStub(channel).ListEvents(admin_pb2.ListEventsRequest()).events
+    (told,) = [event for event in events if event.kind == admin_pb2.EVENT_KIND_REFUSED]
+    assert told.node == "robot-9"
+    assert "upgrade the control plane" in told.text
 
 
 def test_garbage_after_a_good_registration_ends_that_stream_only(alone: ControlPlaneProcess) -> None:

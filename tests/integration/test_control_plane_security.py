@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 import resource
 import socket
@@ -18,12 +19,13 @@ from grpc_reflection.v1alpha import reflection_pb2, reflection_pb2_grpc
 
 from plr.controlplane.ca import Authority, Validity
 from plr.controlplane.serve.tls_gate import MAX_SILENT_PER_SOURCE
+from plr.protos.convert import sidecar_message_to_proto
 from plr.protos.model.ids import Role
 from plr.protos.model.mapping import MappingSet
 from plr.protos.model.members import RemovalReason
 from plr.protos.model.report import Report
 from plr.protos.model.stream import Welcome
-from plr.protos.plr.v1 import admin_pb2, admin_pb2_grpc, control_pb2
+from plr.protos.plr.v1 import admin_pb2, admin_pb2_grpc, control_pb2, control_pb2_grpc
 from plr.protos.trust.identity import CONTROL_PLANE_DNS, IdentityRole
 from tests.support.control_plane_process import PATIENCE_S, Secured, Sidecar, Stream, cloud, open_channel, robot
 from tests.support.samples import registration
@@ -200,6 +202,32 @@ def test_a_revoked_cloud_loses_its_stream_and_its_peers_are_told(plane: SecuredC
             error = refused(plane.address, bad)
             assert error.code() is grpc.StatusCode.UNAUTHENTICATED
             assert "the certificate of cloud-bad is revoked" in str(error)
+
+
+async def write_late(address: str, member: Secured) -> tuple[grpc.StatusCode, bool]:
+    """The status that a refused client finds which writes its registration some round trips after its call, and whether
+    that write went through."""
+    issued = member.issued
+    credentials = grpc.ssl_channel_credentials(member.ca_pem, issued.key_pem, issued.certificate_pem)
+    options = (("grpc.ssl_target_name_override", CONTROL_PLANE_DNS),)
+    async with grpc.aio.secure_channel(address, credentials, options=options) as channel:
+        call = control_pb2_grpc.ControlPlaneStub(channel).Connect()
+        await call.wait_for_connection()
+        await asyncio.sleep(0.1)
+        written = True
+        try:
+            await call.write(sidecar_message_to_proto(registration("late-1")))
+        except (grpc.aio.AioRpcError, asyncio.InvalidStateError):
+            written = False
+        return await call.code(), written
+
+
+def test_a_refusal_waits_for_the_registration_that_it_would_make_fail(plane: SecuredControlPlane) -> None:
+    """A write that fails hides the status of the refusal: gRPC then says INTERNAL."""
+    member = plane.member("late-1")
+    plane.revoke("late-1")
+    for _ in range(3):
+        assert asyncio.run(write_late(plane.address, member)) == (grpc.StatusCode.UNAUTHENTICATED, True)
 
 
 def test_a_certificate_that_ends_takes_its_stream_with_it(plane: SecuredControlPlane) -> None:

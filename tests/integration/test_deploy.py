@@ -79,6 +79,8 @@ BEYOND_CONTRACT: dict[str, set[str]] = {
     "plr_fleet_series_left_out": set(),
     "plr_leases_postponed_total": set(),
     "plr_loop_cpu_seconds_total": set(),
+    "plr_robot_interface_changes_total": {"robot", "interface"},
+    "plr_robot_interface_fault": {"robot", "interface", "fault"},
     "plr_robot_interface_info": {"robot", "interface", "carrier"},
     "plr_robot_interface_up": {"robot", "interface"},
     "plr_robot_mapping_synced": {"robot"},

@@ -13,8 +13,11 @@ import grpc
 import pytest
 
 from plr.controlplane.cli.__main__ import main
+from plr.controlplane.core.explain.faults import FLAPS
+from plr.protos.model.report import Report
 from plr.protos.trust.identity import IdentityRole
 from tests.support.control_plane_process import HEARTBEAT_S, PATIENCE_S, ControlPlaneProcess, Sidecar, cloud, robot
+from tests.support.samples import path
 from tests.support.secured_control_plane import SecuredControlPlane
 
 if TYPE_CHECKING:
@@ -131,6 +134,24 @@ def test_a_revoked_member_is_gone_and_what_it_tries_is_told(tmp_path: Path, caps
             again.next()
         operator.wait_until(lambda: "refused" in kinds(operator.events("--node", "robot-1")))
         plane.stop_flawless()
+
+
+def test_a_flapping_interface_is_told(alone: ControlPlaneProcess, capsys: pytest.CaptureFixture[str]) -> None:
+    operator = Operator(alone.address, capsys)
+    with cloud(alone.address, "cloud-a") as a, alive(a), robot(alone.address) as r:
+        r.mapping("cloud-a", "cloud-a")
+        for number in range(1 + FLAPS):
+            r.send(Report(paths=(path("wlan0", "cloud-a"), path("wwan0", "cloud-a", up=number % 2 == 0))))
+
+        def flaps() -> bool:
+            r.send(Report(paths=(path("wlan0", "cloud-a"), path("wwan0", "cloud-a"))))
+            return "flapping" in kinds(operator.events("--node", "robot"))
+
+        operator.wait_until(flaps)
+        (told,) = [event for event in operator.events("--node", "robot") if event["kind"] == "flapping"]
+        assert told["text"] == "wwan0: it, or a path over it, went up or down 6 times in the last 5 min"
+        assert "wwan0 FLAPPING: it, or a path over it, went up or down 6 times" in operator.ask("status")
+    alone.stop_flawless()
 
 
 def test_a_wrong_time_is_told_with_the_right_ones(capsys: pytest.CaptureFixture[str]) -> None:

@@ -7,8 +7,10 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from lab.simulated.mesh import SERVICE, Mesh, Node, rule
+from lab.simulated.mesh import Mesh, Node, rule
 from plr.protos.model.redundancy_mode import RedundancyMode
+from plr.sidecar.core.base.request_id import OBSERVED_ONE_IN
+from plr.sidecar.core.robot.dispatch.favourites import MISSES
 from plr.sidecar.core.seam.links import SendFinished
 from tests.sim.test_mesh import assert_at_most_once, mapped
 
@@ -16,7 +18,7 @@ if TYPE_CHECKING:
     from plr.sidecar.core.link.link import Link
 
 SIZE = 30_000
-CALLS = 25
+CALLS = 40
 RATE_HZ = 2.0
 
 
@@ -56,17 +58,17 @@ def test_a_server_behind_a_slow_network_is_left(idempotent: bool) -> None:
     mesh, robot, near, far = two_servers(idempotent=idempotent)
     slow_down(mesh, "cloud-a", 5_000)
     outcomes = call(mesh, robot)
-    assert outcomes["ok"] >= CALLS - 5
+    races = 0 if idempotent else CALLS // OBSERVED_ONE_IN  # those of the latter go to the first server mapped
+    assert outcomes["ok"] >= CALLS - MISSES - races - 2
     assert_at_most_once(near, far)
-    assert not idempotent or not outcomes["failed"]
 
 
 def test_it_is_left_when_it_becomes_slow_later() -> None:
     mesh, robot, _, far = two_servers()
     assert call(mesh, robot)["ok"] == CALLS
     slow_down(mesh, "cloud-a", 5_000)
-    assert call(mesh, robot)["ok"] >= 2 * CALLS - 3
-    assert len(far.executed) >= CALLS - 5
+    assert call(mesh, robot)["ok"] >= 2 * CALLS - MISSES - 2
+    assert len(far.executed) >= CALLS - MISSES - 2
 
 
 def deaf(link: Link) -> None:
@@ -90,10 +92,11 @@ def test_where_no_server_is_better_few_bytes_are_spent_on_finding_out() -> None:
     mesh, robot, near, far = two_servers()
     slow_down(mesh, "cloud-a", 5_000)
     slow_down(mesh, "cloud-b", 5_000)
-    outcomes = call(mesh, robot, 4 * CALLS)
+    calls = 4 * CALLS
+    outcomes = call(mesh, robot, calls)
     assert not outcomes["ok"]
     sent = sum(robot.engine.stats.copy_bytes.values())
-    assert sent <= 1.4 * 4 * CALLS * SIZE
+    assert sent <= 1.3 * calls * SIZE, "an eighth are full races"
     assert_at_most_once(near, far)
 
 
@@ -109,7 +112,5 @@ def test_a_good_server_is_not_left_for_an_outage_of_the_robot() -> None:
         mesh.at(at, lambda: cut(to=True))
         mesh.at(at + 1.0, lambda: cut(to=False))
     call(mesh, robot)
-    races = CALLS // 3
     assert len(near.executed) > CALLS - 8
-    assert len(far.executed) <= races + 4
-    assert SERVICE in {service for service, _ in robot.engine.stats.requests}
+    assert len(far.executed) <= CALLS // 3, "full races, and what an outage left without an answer"

@@ -15,6 +15,7 @@ from plr.protos.model.explanation import AlternativeKind, Correlation, Explanati
 from plr.protos.model.ids import InterfaceName, NodeName, Role, ServiceName
 from plr.protos.model.mapping import Assignment, ServiceMapping
 from plr.protos.model.members import AT_MOST_EVERY_INTERFACE, CandidateSet, InterfaceLabel, ServiceSet
+from plr.protos.model.redundancy_mode import RedundancyMode
 from plr.protos.model.report import InterfaceJointReport, JointReport, Report
 from plr.protos.model.status import SyncState
 from tests.support.control_world import SimSidecar, World
@@ -97,6 +98,18 @@ def test_it_tells_what_the_mapping_rests_on(world: World) -> None:
     assert "(10 times):" in text
     assert "fail together: a second copy gains little" in text
     assert "capacity for one robot exceeded by 1" in text
+
+
+@pytest.mark.parametrize("mode", RedundancyMode)
+def test_it_tells_how_copies_are_sent(mode: RedundancyMode) -> None:
+    world = World()
+    world.cloud("a")
+    world.cloud("b")
+    world.all_up(world.robot(redundancy=mode), ("a", "b"))
+    world.run(2.0)
+    found = asked(world)
+    assert found.redundancy is mode
+    assert f"\n  redundancy {mode.value}: " in render(found)
 
 
 def test_one_streak_of_common_misses_is_not_taken_for_proof_nor_for_nothing(world: World) -> None:

@@ -25,6 +25,7 @@ from plr.protos.model.members import (
     ServiceOffer,
     ServiceUse,
 )
+from plr.protos.model.redundancy_mode import RedundancyMode
 from plr.protos.model.report import LatencyReport, PathReport
 
 PLAN = ServiceName("/plan")
@@ -69,8 +70,9 @@ def use(
     type_: str = PLAN_TYPE,
     copies: Copies = EVERY_INTERFACE,
     target_miss: float = 0.0,
+    redundancy: RedundancyMode = RedundancyMode.REPLICATE,
 ) -> ServiceUse:
-    return ServiceUse(ServiceName(name), type_, deadline_s, idempotent, copies, target_miss)
+    return ServiceUse(ServiceName(name), type_, deadline_s, idempotent, copies, target_miss, redundancy=redundancy)
 
 
 def offer(name: str = PLAN, *, capacity: int = 0, type_: str = PLAN_TYPE) -> ServiceOffer:

@@ -17,6 +17,7 @@ from plr.controlplane.core.control.events import (
     CutOffNotice,
     DepartureNotice,
     Event,
+    FaultNotice,
     NackNotice,
     OffersRefusedNotice,
     Settings,
@@ -29,11 +30,12 @@ from plr.controlplane.core.estimate.reached import Reached
 from plr.controlplane.core.estimate.unanswered import Unanswered
 from plr.controlplane.core.explain.departed import Departed, Departure, departure, last_known, why_removed
 from plr.controlplane.core.explain.departed_explanation import explain_departed
-from plr.controlplane.core.explain.explanation import explain, find
+from plr.controlplane.core.explain.explanation import explain, find, whole
+from plr.controlplane.core.explain.faults import Faults
 from plr.controlplane.core.explain.fleet_view import MemberView, view_of
 from plr.controlplane.core.explain.returning import Returning
 from plr.controlplane.core.explain.status import is_met, is_offered, statuses
-from plr.controlplane.core.formulation.block import Picture
+from plr.controlplane.core.formulation.block import Picture, interfaces_of
 from plr.controlplane.core.formulation.problem_builder import MAX_CONSIDERED_INTERFACES, Drawing
 from plr.controlplane.core.overload.pacing import Pacing
 from plr.controlplane.core.overload.urgency import Urgency
@@ -62,6 +64,7 @@ from plr.protos.model.stream import Ack, Drain, Heartbeat, Nack, ResourceKind, W
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Iterable, Iterator, Set
 
+    from plr.controlplane.core.explain.explanation import Pairs
     from plr.controlplane.core.policy.policy import Policy
     from plr.controlplane.core.registry.registry import Sidecar
     from plr.protos.model.explanation import Explanation
@@ -152,6 +155,7 @@ class ControlCore:
         self.urgency = Urgency()
         self.reached = Reached()
         self.unanswered = Unanswered()
+        self.faults = Faults()
         self._publish_at: float | None = None
         self._publications: deque[Iterator[SendMessage | None]] = deque()
         """Publications begun, and told to some; the first one continues first."""
@@ -251,7 +255,9 @@ class ControlCore:
 
     def _announced(self, name: NodeName, told: CandidateSet | ServiceSet, now: float) -> None:
         if isinstance(told, CandidateSet):
+            known = self.registry.get(name)
             changed = self.registry.set_candidates(name, told)
+            self._note_links(name, known, now)
             if changed:
                 interfaces = len({candidate.interface for candidate in told.candidates})
                 self.counters.interfaces_left_out += max(0, interfaces - MAX_CONSIDERED_INTERFACES)
@@ -268,6 +274,14 @@ class ControlCore:
             self._members_changed(now, sidecar.role)
             if isinstance(told, ServiceSet):
                 self._note_refused_offers(name)
+
+    def _note_links(self, name: NodeName, before: Sidecar | None, now: float) -> None:
+        """Note which interfaces a robot announces that it did not before, or no longer."""
+        sidecar = self.registry.get(name)
+        if sidecar is None or before is None or before.candidates is None or sidecar.role is not Role.ROBOT:
+            return
+        if changed := set(interfaces_of(before)) ^ set(interfaces_of(sidecar)):
+            self.faults.note_links(name, sorted(changed), now)
 
     def _receive_report(self, name: NodeName, report: Report, now: float) -> None:
         sidecar = self.registry.get(name)
@@ -296,8 +310,25 @@ class ControlCore:
             else:
                 change = Change.REPORT
         self._debounce.note(change, now)
+        if not (report.more or report.changes_only) and self.faults.is_due(name, now):
+            self._look_for_faults(sidecar, now)
         if reaches_again:
             self._publish_soon(now)
+
+    def _look_for_faults(self, robot: Sidecar, now: float) -> None:
+        name = robot.name
+        announced = set(interfaces_of(robot))
+        there: dict[NodeName, bool] = {}
+        for server in {server for _, server in self.estimator.path_states(name)}:
+            there[server] = is_met(name, server, self.registry, self.permits)
+        paths = {
+            (interface, server): path
+            for (interface, server), path in self.estimator.path_states(name).items()
+            if interface in announced and there[server]
+        }
+        blocks = self._drawing.blocks(name, (use.name for use in robot.uses))
+        for one in self.faults.look(name, paths, blocks, now):
+            self._events.append(FaultNotice(name, one.found, one.over))
 
     def _note_goodbyes(self, robot: NodeName, servers: Iterable[NodeName]) -> None:
         """Take what a robot knows of servers that left while the control plane was away, and that it may call."""
@@ -551,6 +582,7 @@ class ControlCore:
 
     def _forget_paths(self, name: NodeName) -> None:
         self.unanswered.forget(name)
+        self.faults.forget(name)
         self.estimator.forget_paths(name)
         self._drawing.robot_changed(name)
 
@@ -699,13 +731,24 @@ class ControlCore:
                 self.estimator,
                 self.permits,
                 self.unanswered,
+                self.faults,
                 now,
                 abridged=abridged,
             )
         )
 
     def explain(self, robot: NodeName, service: ServiceName, now: float) -> Explanation:
-        """Explain why requests go, or went, where they do. Raise UnknownNameError if robot or service is unknown."""
+        """Return all that `explain_in_parts` explains."""
+        return whole(self.explain_in_parts(robot, service, lambda: now))
+
+    def explain_in_parts(
+        self, robot: NodeName, service: ServiceName, clock: Callable[[], float]
+    ) -> tuple[Explanation, Pairs]:
+        """Explain why requests go, or went, where they do. Raise UnknownNameError if robot or service is unknown.
+
+        Return the explanation without its pairs, and these, made as they are read at the times that `clock` returns.
+        """
+        now = clock()
         gone = self.departed.get(robot)
         if gone is not None and gone.role is Role.ROBOT and self.registry.get(robot) is None:
             last = self.departed.last_known(robot)
@@ -721,7 +764,7 @@ class ControlCore:
             sent=mapping.sent or (),
             sync=mapping.status,
             history=self.history.of(BlockKey(robot, service)),
-            now=now,
+            clock=clock,
         )
 
     def sync_states(self) -> Iterator[tuple[NodeName, ResourceKind, SyncState]]:
@@ -741,6 +784,7 @@ class ControlCore:
             self.estimator,
             self.reached,
             self.unanswered,
+            self.faults,
             is_there=lambda server: is_met(name, server, self.registry, self.permits),
             is_offered=lambda service: is_offered(name, service, self.registry, self.permits),
             may_offer=lambda service: self.permits.may_offer(name, service),

@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from plr.controlplane.core.policy.path_rules import PathRule
     from plr.controlplane.core.policy.policy import Policy
     from plr.protos.model.ids import NodeName, Role, ServiceName
+    from plr.protos.model.status import InterfaceFault
     from plr.protos.model.stream import Nack, ResourceKind
 
 
@@ -102,6 +103,15 @@ class UnmetNotice:
 
 
 @dataclass(frozen=True, slots=True)
+class FaultNotice:
+    """An interface of a robot is no help to it although it is up, or (`over`) this has ended."""
+
+    sidecar: NodeName
+    found: InterfaceFault
+    over: bool
+
+
+@dataclass(frozen=True, slots=True)
 class OffersRefusedNotice:
     """A cloud offers services that the policy does not let it, for the log; each is told once."""
 
@@ -118,5 +128,6 @@ Event = (
     | CutOffNotice
     | UnmetNotice
     | OffersRefusedNotice
+    | FaultNotice
 )
 """What the driver has to do, in this order."""

@@ -318,6 +318,11 @@ class Estimator:
         tables = self._robots.get(robot)
         return tables.network.paths if tables is not None else {}
 
+    def path_changes(self, robot: NodeName) -> Mapping[InterfaceName, int]:
+        """Return how often paths over each interface of a robot went up or down, as far as it reported that."""
+        tables = self._robots.get(robot)
+        return tables.network.changes if tables is not None else {}
+
     def path_views(self, robot: NodeName) -> Iterator[ReportedPath]:
         """Yield each path of a robot as last reported, with its remembered round trips."""
         tables = self._robots.get(robot)

@@ -9,7 +9,7 @@ not even probed gets its round trip from its two ends: how its interface and its
 from __future__ import annotations
 
 import math
-from collections import OrderedDict
+from collections import OrderedDict, deque
 from dataclasses import dataclass
 from itertools import islice
 from statistics import median
@@ -40,6 +40,9 @@ MAX_PATHS_PER_ROBOT = 1024
 
 MAX_CELLS = 1024
 """Network histograms kept of one robot, one per path and size class; the least recently reported one is evicted."""
+
+MAX_PATH_CHANGES = 16
+"""Changes of one path (up or down) whose times are kept; the oldest one is forgotten."""
 
 NEIGHBOURS = 2
 """Other servers over the same interface whose requests are consulted: those with the most of them."""
@@ -114,6 +117,12 @@ class PathRecord:
     last: PathReport
     answered: bool = False
     """Whether it ever was up."""
+    changed: deque[float] | None = None
+    """When it last went up or down, the latest last; None: never."""
+
+    def changes_since(self, since: float) -> int:
+        """Return how often it has gone up or down since then, at most MAX_PATH_CHANGES."""
+        return sum(at >= since for at in self.changed) if self.changed is not None else 0
 
     def loss(self) -> float:
         """Return the lost share of what was sent, of datagrams or of probes, whichever is worse."""
@@ -133,6 +142,8 @@ class RobotNetwork:
         self.paths: OrderedDict[PathKey, PathRecord] = OrderedDict()
         self._answered_over: set[InterfaceName] = set()
         """Interfaces over which any server ever answered."""
+        self.changes: dict[InterfaceName, int] = {}
+        """How often a path over each interface went up or down, of as many interfaces as paths."""
         self._cells: OrderedDict[CellKey, FadedHistogram] = OrderedDict()
         self._clocks: dict[int, HeardClock] = {}
         """One for the cells of each size class."""
@@ -168,6 +179,8 @@ class RobotNetwork:
             )
         self._keep(self.paths, key, state, MAX_PATHS_PER_ROBOT)
         changed = known is None or known.up != path.up
+        if known is not None and changed:
+            self._note_change(path.interface, known, now)
         state.up = path.up
         if path.up and not state.answered:
             state.answered = True
@@ -178,6 +191,13 @@ class RobotNetwork:
         # Datagrams sent before the last report may be found lost only now: no more count as lost than were sent.
         state.datagrams.add(path.datagrams_sent, min(path.datagrams_lost, path.datagrams_sent), now)
         return changed
+
+    def _note_change(self, interface: InterfaceName, path: PathRecord, now: float) -> None:
+        if path.changed is None:
+            path.changed = deque(maxlen=MAX_PATH_CHANGES)
+        path.changed.append(now)
+        if interface in self.changes or len(self.changes) < MAX_PATHS_PER_ROBOT:
+            self.changes[interface] = self.changes.get(interface, 0) + 1
 
     def leads_there(self, key: PathKey) -> bool:
         """Return whether the path ever was up, or nothing ever was over its interface.

@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from plr.controlplane.core.estimate.estimator import Estimator, Evidence
     from plr.controlplane.core.estimate.shared_fate import CommonMisses
     from plr.controlplane.core.explain.departed import Departure, LastKnown
+    from plr.controlplane.core.explain.explanation import Pairs
     from plr.controlplane.core.publish.history import MappingHistory
     from plr.protos.model.explanation import Explanation
     from plr.protos.model.ids import InterfaceName, NodeName, ServiceName
@@ -63,8 +64,12 @@ def explain_departed(
     estimator: Estimator,
     history: MappingHistory,
     now: float,
-) -> Explanation:
-    """Explain it; its times count from the departure. Raise UnknownNameError if it is forgotten, or knew none such."""
+) -> tuple[Explanation, Pairs]:
+    """Explain it, as `explain` does. Its times count from the departure.
+
+    Raises:
+        UnknownNameError: it is forgotten, or knew no such service.
+    """
     if last is None:
         raise UnknownNameError(
             f"{gone.name} is gone ({gone.why.value}), and what was known about it is forgotten; see: plr events --node "
@@ -73,7 +78,7 @@ def explain_departed(
     use = find_use(last.sidecar, service)
     key = BlockKey(gone.name, service)
     blocks = tuple(plan.block for plan in last.plans.values() if plan.block is not None)
-    found = explain(
+    found, pairs = explain(
         last.sidecar,
         use,
         picture=Picture(Problem(blocks, {}, last.objective), last.notes),
@@ -82,6 +87,6 @@ def explain_departed(
         sent=last.mapping,
         sync=last.sync,
         history=history.of(key),
-        now=gone.at,
+        clock=lambda: gone.at,
     )
-    return replace(found, gone_s=max(0.0, now - gone.at), gone_why=gone.why)
+    return replace(found, gone_s=max(0.0, now - gone.at), gone_why=gone.why), pairs

@@ -1,5 +1,7 @@
 """Remembers the last events of the fleet. When they are too many, the member with most of them loses its oldest: no
-member, however restless, pushes out what is known of others."""
+member, however restless, pushes out what is known of others.
+
+Those of refused sidecars have a room of their own: in insecure mode, anybody may cause them, under any names."""
 
 from __future__ import annotations
 
@@ -9,6 +11,7 @@ from typing import TYPE_CHECKING
 
 from plr.controlplane.core.base.holders import Holders
 from plr.protos.base.token_bucket import TokenBucket
+from plr.protos.model.fleet_events import EventKind
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -19,6 +22,9 @@ if TYPE_CHECKING:
 
 MAX_EVENTS = 8192
 """Events remembered: two for each of the sidecars that can be registered."""
+
+MAX_REFUSALS = 1024
+"""Events among these that tell of a refusal; beyond that the name with most of them loses its oldest."""
 
 EVENTS_BURST = 64.0
 """Events of one member taken at once: a bad hour."""
@@ -35,8 +41,8 @@ class EventMemory:
 
     def __init__(self) -> None:
         self._events: OrderedDict[int, FleetEvent] = OrderedDict()
-        self._of: dict[Owner, deque[int]] = {}
-        self._holders: Holders[Owner] = Holders()
+        self._members = _Owned()
+        self._refusals = _Owned()
         self._shares: dict[Owner, tuple[TokenBucket, TokenBucket]] = {}
         """Shares of those who have events, so that there are no more shares than events; the second is for presence."""
         self.evicted = 0
@@ -75,17 +81,46 @@ class EventMemory:
     def add(self, event: FleetEvent) -> None:
         """Keep an event whose number is above all others'."""
         self._events[event.number] = event
-        self._of.setdefault(event.node, deque()).append(event.number)
-        self._holders.add(event.node)
+        if event.kind is EventKind.REFUSED:
+            self._refusals.add(event.node, event.number)
+            if self._refusals.count > MAX_REFUSALS:
+                self._evict(self._refusals)
+        else:
+            self._members.add(event.node, event.number)
         if len(self._events) > MAX_EVENTS:
-            self._evict()
+            self._evict(self._members)
 
-    def _evict(self) -> None:
+    def _evict(self, among: _Owned) -> None:
+        owner, number = among.take_from_greediest()
+        del self._events[number]
+        if owner not in self._members:
+            self._shares.pop(owner, None)
+        self.evicted += 1
+
+
+class _Owned:
+    """The numbers of events, by whom they are about."""
+
+    def __init__(self) -> None:
+        self.count = 0
+        self._of: dict[Owner, deque[int]] = {}
+        self._holders: Holders[Owner] = Holders()
+
+    def __contains__(self, owner: Owner) -> bool:
+        return owner in self._of
+
+    def add(self, owner: Owner, number: int) -> None:
+        self._of.setdefault(owner, deque()).append(number)
+        self._holders.add(owner)
+        self.count += 1
+
+    def take_from_greediest(self) -> tuple[Owner, int]:
+        """Remove the oldest event of the owner with most of them; return both."""
         owner = self._holders.greediest()
         self._holders.remove(owner)
         own = self._of[owner]
-        del self._events[own.popleft()]
+        number = own.popleft()
         if not own:
             del self._of[owner]
-            self._shares.pop(owner, None)
-        self.evicted += 1
+        self.count -= 1
+        return owner, number

@@ -7,9 +7,12 @@ from __future__ import annotations
 
 import difflib
 import heapq
+from collections.abc import Iterator
+from dataclasses import replace
+from itertools import islice
 from typing import TYPE_CHECKING, Protocol
 
-from plr.controlplane.core.estimate.beta import intervals
+from plr.controlplane.core.estimate.beta import interval_steps
 from plr.controlplane.core.explain import alternatives
 from plr.controlplane.core.formulation.block import BlockNotes, interfaces_of
 from plr.controlplane.core.problem.mode_miss import miss_of, predicted_miss
@@ -19,7 +22,7 @@ from plr.protos.model.ids import Role
 from plr.protos.model.mapping import Assignment
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+    from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 
     from plr.controlplane.core.estimate.estimator import Evidence
     from plr.controlplane.core.estimate.posterior import Estimate
@@ -86,6 +89,8 @@ def find(registry: Registry, permits: Permits, robot: NodeName, service: Service
         raise UnknownNameError(f"no robot {robot} is registered{_nearest(robot, robots)}")
     if sidecar.role is not Role.ROBOT:
         raise UnknownNameError(f"{robot} is a cloud: ask about a robot")
+    if any(use.name == service for use in sidecar.uses):
+        return sidecar, find_use(sidecar, service)
     group = permits.group(robot)
     offered: set[ServiceName] = set()
     lost: list[NodeName] = []
@@ -178,6 +183,16 @@ def _common_beginning(first: str, second: str) -> int:
     return common
 
 
+Pairs = Iterator[PairExplanation | None]
+"""The pairs of an explanation, made as they are read; None after a step that made none."""
+
+
+def whole(parts: tuple[Explanation, Pairs]) -> Explanation:
+    """Return an explanation with all its pairs."""
+    head, pairs = parts
+    return replace(head, pairs=tuple(pair for pair in pairs if pair is not None))
+
+
 def explain(
     robot: Sidecar,
     use: ServiceUse,
@@ -188,20 +203,27 @@ def explain(
     sent: tuple[ServiceMapping, ...],
     sync: ResourceStatus,
     history: History | None,
-    now: float,
-) -> Explanation:
-    """Explain the mapping in force for this use of this robot; `sent` and `sync` are what it was last told."""
+    clock: Callable[[], float],
+) -> tuple[Explanation, Pairs]:
+    """Explain the mapping in force for this use of this robot; `sent` and `sync` are what it was last told.
+
+    Return the explanation without its pairs, and these: a thousand take a quarter of a second, and the caller may do
+    other work in between. `clock` returns the present time of each step.
+    """
+    now = clock()
     key = BlockKey(robot.name, use.name)
     block = next((block for block in picture.problem.blocks if block.key == key), None)
     mapping = next((found for found in sent if found.service == use.name), None)
-    paths = _paths(robot, picture, key, mapping)
     planned = plan.blocks.get(key)
     notes = picture.notes.get(key) or BlockNotes()
+    interfaces, servers = interfaces_of(robot), _servers(notes, mapping)
+    chosen = set(mapping.assignments) if mapping is not None else set()
+    shown, left_out = _shown(interfaces, servers, chosen, block)
 
     def miss(of: Block, choice: Choice) -> float:
         return miss_of(use, of, choice, notes.sending)
 
-    return Explanation(
+    head = Explanation(
         robot=robot.name,
         service=use.name,
         deadline_s=use.deadline_s,
@@ -214,45 +236,79 @@ def explain(
         observed_miss=estimator.observed_miss_ratio(robot.name, use.name, now),
         target_miss=use.target_miss,
         cost_per_request=_cost_per_request(block, planned),
-        pairs=_pairs(paths, notes, block, estimator, key, mapping, now),
-        pairs_left_out=max(0, len(paths) - MAX_SHOWN_PAIRS),
+        pairs=(),
+        pairs_left_out=left_out,
         joints=_joints(robot.name, use.name, block, estimator, now),
         alternatives=alternatives.of(picture.problem, plan, block, miss) if block is not None else (),
         changes=_changes(history, now),
+        redundancy=use.redundancy,
     )
+    return head, _pairs(shown, chosen, notes, block, estimator, key, clock)
 
 
-def _paths(robot: Sidecar, picture: Picture, key: BlockKey, mapping: ServiceMapping | None) -> list[Assignment]:
-    notes = picture.notes.get(key)
-    live = notes.servers if notes is not None else ()
+def _servers(notes: BlockNotes, mapping: ServiceMapping | None) -> tuple[NodeName, ...]:
     # The mapping in force may name a server that is gone since.
     mapped = (path.server for path in mapping.assignments) if mapping is not None else ()
-    servers = dict.fromkeys((*live, *mapped))
-    return [Assignment(interface, server) for interface in interfaces_of(robot) for server in servers]
+    return tuple(dict.fromkeys((*notes.servers, *mapped)))
+
+
+def _shown(
+    interfaces: tuple[InterfaceName, ...],
+    servers: tuple[NodeName, ...],
+    chosen: Collection[Assignment],
+    block: Block | None,
+) -> tuple[list[Assignment], int]:
+    """Return the pairs to show, those in use first, then the best ones, and how many others there are.
+
+    There may be a million, most of which are not known to be good or bad.
+    """
+    row = {interface: number for number, interface in enumerate(interfaces)}
+    column = {server: number for number, server in enumerate(servers)}
+    means = dict(_means(block))
+    ranked = [path for path in {*chosen, *means} if path.interface in row and path.server in column]
+
+    def rank(path: Assignment) -> tuple[bool, float, int, int]:
+        return path not in chosen, means.get(path, 2.0), row[path.interface], column[path.server]
+
+    ranked.sort(key=rank)
+    first = ranked[:MAX_SHOWN_PAIRS]
+    known = set(ranked)
+    every = (Assignment(interface, server) for interface in interfaces for server in servers)
+    rest = (path for path in every if path not in known)
+    shown = [*first, *islice(rest, MAX_SHOWN_PAIRS - len(first))]
+    return shown, len(interfaces) * len(servers) - len(shown)
+
+
+def _means(block: Block | None) -> Iterator[tuple[Assignment, float]]:
+    """Yield the pairs of a block whose miss probability is estimated, and that probability."""
+    if block is None or not block.weights:
+        return
+    for interface, row in zip(block.interfaces, block.epsilon, strict=True):
+        for server, epsilon in zip(block.servers, row, strict=True):
+            if epsilon is not None:
+                yield Assignment(interface, server), epsilon
 
 
 def _pairs(
     paths: list[Assignment],
+    chosen: Collection[Assignment],
     notes: BlockNotes,
     block: Block | None,
     estimator: Measured,
     key: BlockKey,
-    mapping: ServiceMapping | None,
-    now: float,
-) -> tuple[PairExplanation, ...]:
-    chosen = set(mapping.assignments) if mapping is not None else set()
-    known = {path: estimate for path in paths if (estimate := _estimate(block, path)) is not None}
-    beliefs = dict(zip(known, _beliefs(list(known.values())), strict=True))
-
-    def rank(path: Assignment) -> tuple[bool, float]:
-        return path not in chosen, beliefs[path].mean if path in beliefs else 2.0
-
-    penalties = estimator.penalties(key.robot, now)
-    found: list[PairExplanation] = []
-    for path in sorted(paths, key=rank)[:MAX_SHOWN_PAIRS]:
-        penalty = penalties.get(path.server)
+    clock: Callable[[], float],
+) -> Pairs:
+    estimates = {path: estimate for path in paths if (estimate := _estimate(block, path)) is not None}
+    intervals = yield from interval_steps(list(estimates.values()), LEVEL)
+    beliefs = {
+        path: Belief(estimate.mean, low, high)
+        for (path, estimate), (low, high) in zip(estimates.items(), intervals, strict=True)
+    }
+    for path in paths:
+        now = clock()
+        penalty = estimator.penalties(key.robot, now).get(path.server)
         evidence = estimator.evidence(key.robot, path, key.service, now)
-        found.append(
+        yield (
             PairExplanation(
                 path=path,
                 chosen=path in chosen,
@@ -273,18 +329,12 @@ def _pairs(
                 bad_answers=penalty.bad_answers if penalty is not None else 0,
             )
         )
-    return tuple(found)
 
 
 def _estimate(block: Block | None, path: Assignment) -> Estimate | None:
     if block is None or path.interface not in block.interfaces or path.server not in block.servers:
         return None
     return block.estimate((block.interfaces.index(path.interface), block.servers.index(path.server)))
-
-
-def _beliefs(estimates: list[Estimate]) -> Iterator[Belief]:
-    for estimate, (low, high) in zip(estimates, intervals(estimates, LEVEL), strict=True):
-        yield Belief(estimate.mean, low, high)
 
 
 def _joints(

@@ -11,7 +11,7 @@ from plr.controlplane.core.formulation.block import interfaces_of
 from plr.controlplane.core.problem.mode_miss import NO_SENDING, predicted_miss
 from plr.controlplane.core.problem.problem import BlockKey
 from plr.protos.model.ids import Role
-from plr.protos.model.status import SyncState
+from plr.protos.model.status import Fault, SyncState
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from plr.controlplane.core.estimate.network import ReportedPath
     from plr.controlplane.core.estimate.reached import Reached
     from plr.controlplane.core.estimate.unanswered import Unanswered
+    from plr.controlplane.core.explain.faults import Faults
     from plr.controlplane.core.formulation.block import Picture
     from plr.controlplane.core.problem.plan import Plan
     from plr.controlplane.core.publish.snapshots import Snapshots
@@ -41,6 +42,10 @@ class InterfaceView:
     """Whose network it uses; its own name if that is unknown."""
     up: bool
     """Whether it carries anything, as the robot says."""
+    changes: int = 0
+    """How often it, or a path over it, went up or down."""
+    faults: frozenset[Fault] = frozenset()
+    """What is wrong with it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,6 +96,8 @@ class MemberView:
     """Servers that it has never reached, and that only one other robot claims to have reached."""
     follows: bool = True
     """Whether it has confirmed the mapping that it was last sent, if there is one."""
+    restless: frozenset[NodeName] = frozenset()
+    """Servers that its paths go up and down to over several interfaces, while paths to others do not."""
     servers: int = 0
     """How many servers a robot was sent: registered ones on which the policy lets it call something."""
     served: tuple[ServedView, ...] = ()
@@ -105,6 +112,7 @@ def view_of(
     estimator: Estimator,
     reached: Reached,
     unanswered: Unanswered,
+    faults: Faults,
     *,
     is_there: Callable[[NodeName], bool],
     is_offered: Callable[[ServiceName], bool],
@@ -124,9 +132,21 @@ def view_of(
     # gone.
     carriers = dict.fromkeys(interfaces_of(sidecar)[:MAX_VIEWED], "")
     carriers |= {label.interface: label.carrier for label in sidecar.labels if label.interface in carriers}
-    interfaces = [InterfaceView(name, carrier or name, up=True) for name, carrier in carriers.items()]
-    down = (label for label in sidecar.down if label.interface not in carriers)
-    interfaces += (InterfaceView(label.interface, label.carrier or label.interface, up=False) for label in down)
+    carriers_down = {label.interface: label.carrier for label in sidecar.down if label.interface not in carriers}
+    wrong: dict[InterfaceName, set[Fault]] = {}
+    for one in faults.of(sidecar.name, carriers | carriers_down):
+        wrong.setdefault(one.interface, set()).add(one.fault)
+    changes = estimator.path_changes(sidecar.name)
+    interfaces = [
+        InterfaceView(
+            name,
+            carrier or name,
+            up=name in carriers,
+            changes=changes.get(name, 0) + faults.link_changes(sidecar.name, name),
+            faults=frozenset(wrong.get(name, ())),
+        )
+        for name, carrier in (carriers | carriers_down).items()
+    ]
     servers: dict[NodeName, bool] = {}
     found: list[ReportedPath] = []
     for path in estimator.path_views(sidecar.name):
@@ -154,6 +174,7 @@ def view_of(
         doubted=frozenset(
             server for server in unreached if reached.witnesses(server) == 1 and not reached.by(sidecar.name, server)
         ),
+        restless=faults.restless_servers(sidecar.name) & servers.keys(),
         follows=mapping.state not in (SyncState.STALE, SyncState.REJECTED),
         servers=len(peers.peers) if peers is not None else 0,
     )

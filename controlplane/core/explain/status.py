@@ -13,6 +13,7 @@ if TYPE_CHECKING:
 
     from plr.controlplane.core.estimate.estimator import Estimator
     from plr.controlplane.core.estimate.unanswered import Unanswered
+    from plr.controlplane.core.explain.faults import Faults
     from plr.controlplane.core.policy.permits import Permits
     from plr.controlplane.core.publish.publisher import Publisher
     from plr.controlplane.core.registry.registry import Registry
@@ -38,6 +39,7 @@ def statuses(
     estimator: Estimator,
     permits: Permits,
     unanswered: Unanswered,
+    faults: Faults,
     now: float,
     *,
     abridged: bool,
@@ -56,7 +58,8 @@ def statuses(
             if path.interface in announced and is_met(name, path.server, registry, permits)
         )
         in_order = all(path.up for path in paths) and all(mapping.assignments for mapping in services)
-        shorter = abridged and in_order and not sidecar.down
+        wrong = faults.of(name, announced | {label.interface for label in sidecar.down})
+        shorter = abridged and in_order and not sidecar.down and not wrong
         yield SidecarStatus(
             peer=replace(sidecar.as_peer(), candidates=()) if shorter else sidecar.as_peer(),
             connected=sidecar.stream is not None,
@@ -73,6 +76,7 @@ def statuses(
             untyped=sidecar.untyped,
             unreached=sidecar.unreached,
             down=tuple(label.interface for label in sidecar.down),
+            faults=wrong,
             withdrawn=tuple(sorted(sidecar.withdrawn.difference(sidecar.unmet))),
             unanswered={
                 offer.name: row for offer in sidecar.offers if (row := unanswered.row(sidecar.name, offer.name, now))

@@ -52,6 +52,10 @@ LEAST_INTERFACES = 16
 LOOKED_AT_ONCE = 200
 """Uses, or robots without any, checked in one go for who could serve them: some milliseconds."""
 
+CLOUDS_A_LOOK = 8
+"""Clouds, of those that could serve a use, that count as one more use: if a policy has a rule for each robot, all of
+them are asked for each robot."""
+
 FEW_ROBOTS = 16
 """Up to this many robots to be drawn at once are all re-estimated; of more, only those that have to be."""
 
@@ -161,6 +165,8 @@ class Drawing:
         """The policy, and what matters of the clouds, when ..."""
         self._looked_at: dict[NodeName, _LookedAt] = {}
         """... these robots were last examined."""
+        self._outdated: dict[NodeName, _LookedAt] = {}
+        """What holds no longer; freed robot by robot, as all of it at once takes tens of milliseconds."""
         self._drawn: dict[BlockKey, _Drawn] = {}
         self._at: dict[NodeName, float] = {}
         """When each robot was last drawn."""
@@ -206,6 +212,13 @@ class Drawing:
     def is_urgent(self, robot: NodeName) -> bool:
         """Return whether it is to be drawn whatever it costs."""
         return robot in self._urgent
+
+    def blocks(self, robot: NodeName, services: Iterable[ServiceName]) -> Iterator[Block]:
+        """Yield the blocks of a robot's uses of these services as last drawn, as far as there are any."""
+        for service in services:
+            drawn = self._drawn.get(BlockKey(robot, service))
+            if drawn is not None and drawn.block is not None:
+                yield drawn.block
 
     def cost(self, robot: NodeName) -> int:
         """Return how many pairs it takes to draw a robot."""
@@ -387,6 +400,7 @@ class Drawing:
         fleet_capacity: dict[FleetKey, int] = {}
         robots: list[Sidecar] = []
         around: list[object] = [permits]
+        looked_at = 0
         for sidecar in sorted(sidecars, key=lambda sidecar: sidecar.registration.name):
             if sidecar.role is Role.ROBOT:
                 robots.append(sidecar)
@@ -394,17 +408,23 @@ class Drawing:
             if sidecar.draining:
                 continue
             around.append((sidecar.registration, sidecar.services, sidecar.offered))
-            for offer in sidecar.offers:
+            offers = sidecar.offers
+            for offer in offers:
                 clouds.setdefault((offer.name, offer.type), []).append(_Offered(sidecar, offer))
                 if offer.capacity:
                     fleet_capacity[FleetKey(sidecar.name, offer.name)] = offer.capacity
+            looked_at += len(offers) // CLOUDS_A_LOOK
+            if looked_at >= LOOKED_AT_ONCE:
+                looked_at = 0
+                yield
         if around != self._around:
             self._around = around
-            self._looked_at.clear()
+            self._outdated |= self._looked_at
+            self._looked_at = {}
         callable_by: dict[tuple[Group, ServiceName, str], tuple[_Offered, ...]] = {}
         uses: dict[NodeName, tuple[tuple[BlockKey, _Inputs], ...]] = {}
-        looked_at = 0
         for robot in robots:
+            self._outdated.pop(robot.name, None)
             known = self._looked_at.get(robot.name)
             if known is not None and known.holds_for(robot):
                 uses[robot.name] = known.uses
@@ -416,10 +436,19 @@ class Drawing:
                 kind = group, use.name, use.type
                 offered = clouds.get((use.name, use.type), [])
                 if kind not in callable_by:
-                    callable_by[kind] = tuple(one for one in offered if use.name in permits.of(group, one.cloud))
+                    may_call: list[_Offered] = []
+                    for begin in range(0, len(offered), CLOUDS_A_LOOK):
+                        some = offered[begin : begin + CLOUDS_A_LOOK]
+                        may_call += (one for one in some if use.name in permits.of(group, one.cloud))
+                        looked_at += len(some) // CLOUDS_A_LOOK
+                        if looked_at >= LOOKED_AT_ONCE:
+                            looked_at = 0
+                            yield
+                    callable_by[kind] = tuple(may_call)
                 found.append((BlockKey(robot.name, use.name), _inputs(ways, use, offered, callable_by[kind])))
-                looked_at += 1
-                if looked_at % LOOKED_AT_ONCE == 0:
+                looked_at += 1 + len(callable_by[kind]) // CLOUDS_A_LOOK
+                if looked_at >= LOOKED_AT_ONCE:
+                    looked_at = 0
                     yield
             uses[robot.name] = tuple(found)
             self._looked_at[robot.name] = _LookedAt(robot, uses[robot.name])
@@ -427,7 +456,8 @@ class Drawing:
                 self.robot_changed(robot.name, estimate_again=False)
             if not found:
                 looked_at += 1
-                if looked_at % LOOKED_AT_ONCE == 0:
+                if looked_at >= LOOKED_AT_ONCE:
+                    looked_at = 0
                     yield
         self._forget_others(uses)
         self._frame = _Frame(uses, fleet_capacity)
@@ -437,7 +467,7 @@ class Drawing:
         for drawn in [key for key in self._drawn if key not in keys]:
             del self._drawn[drawn]
         tables: tuple[dict[NodeName, Any], ...]
-        tables = self._at, self._surprise, self._looked_at, self._aside, self._rests, self._first
+        tables = self._at, self._surprise, self._looked_at, self._outdated, self._aside, self._rests, self._first
         for table in tables:
             for gone in [name for name in table if name not in uses]:
                 del table[gone]

@@ -67,6 +67,8 @@ class Refusal(enum.Enum):
     NAME_MISMATCH = "the certificate has another name: set name to the certificate's, or leave it out"
     WRONG_ROLE = "the certificate has another role: set role to the certificate's, or leave it out"
     BAD_CREDENTIAL = "the credential is of another run, or is not signed with this certificate"
+    VERSION = "it speaks no version of the protocol that this control plane speaks"
+    MALFORMED = "its first message is no registration, or one that has no meaning here"
 
 
 @dataclass(frozen=True, slots=True)

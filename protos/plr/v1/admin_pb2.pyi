@@ -45,6 +45,27 @@ SYNC_STATE_SYNCED: SyncState.ValueType  # 3
 SYNC_STATE_REJECTED: SyncState.ValueType  # 4
 Global___SyncState: _TypeAlias = SyncState  # noqa: Y015
 
+class _Fault:
+    ValueType = _typing.NewType("ValueType", _builtins.int)
+    V: _TypeAlias = ValueType  # noqa: Y015
+
+class _FaultEnumTypeWrapper(_enum_type_wrapper._EnumTypeWrapper[_Fault.ValueType], _builtins.type):
+    DESCRIPTOR: _descriptor.EnumDescriptor
+    FAULT_UNSPECIFIED: _Fault.ValueType  # 0
+    FAULT_FLAPPING: _Fault.ValueType  # 1
+    """A path over the interface goes up and down all the time."""
+    FAULT_USELESS: _Fault.ValueType  # 2
+    """A path over it is up, but nothing arrives in time, or most is lost."""
+
+class Fault(_Fault, metaclass=_FaultEnumTypeWrapper): ...
+
+FAULT_UNSPECIFIED: Fault.ValueType  # 0
+FAULT_FLAPPING: Fault.ValueType  # 1
+"""A path over the interface goes up and down all the time."""
+FAULT_USELESS: Fault.ValueType  # 2
+"""A path over it is up, but nothing arrives in time, or most is lost."""
+Global___Fault: _TypeAlias = Fault  # noqa: Y015
+
 class _DepartureReason:
     ValueType = _typing.NewType("ValueType", _builtins.int)
     V: _TypeAlias = ValueType  # noqa: Y015
@@ -98,6 +119,9 @@ class _EventKindEnumTypeWrapper(_enum_type_wrapper._EnumTypeWrapper[_EventKind.V
     EVENT_KIND_POLICY: _EventKind.ValueType  # 10
     EVENT_KIND_CUT_OFF: _EventKind.ValueType  # 11
     EVENT_KIND_REJOINED: _EventKind.ValueType  # 12
+    EVENT_KIND_FLAPPING: _EventKind.ValueType  # 13
+    EVENT_KIND_USELESS: _EventKind.ValueType  # 14
+    EVENT_KIND_RECOVERED: _EventKind.ValueType  # 15
 
 class EventKind(_EventKind, metaclass=_EventKindEnumTypeWrapper): ...
 
@@ -114,6 +138,9 @@ EVENT_KIND_UNMET: EventKind.ValueType  # 9
 EVENT_KIND_POLICY: EventKind.ValueType  # 10
 EVENT_KIND_CUT_OFF: EventKind.ValueType  # 11
 EVENT_KIND_REJOINED: EventKind.ValueType  # 12
+EVENT_KIND_FLAPPING: EventKind.ValueType  # 13
+EVENT_KIND_USELESS: EventKind.ValueType  # 14
+EVENT_KIND_RECOVERED: EventKind.ValueType  # 15
 Global___EventKind: _TypeAlias = EventKind  # noqa: Y015
 
 class _PathState:
@@ -277,6 +304,7 @@ class SidecarStatus(_message.Message):
     UNANSWERED_FIELD_NUMBER: _builtins.int
     UNTYPED_FIELD_NUMBER: _builtins.int
     UNREACHED_FIELD_NUMBER: _builtins.int
+    FAULTS_FIELD_NUMBER: _builtins.int
     connected: _builtins.bool
     lease_left_us: _builtins.int
     software_version: _builtins.str
@@ -326,6 +354,10 @@ class SidecarStatus(_message.Message):
     def unreached(self) -> _containers.RepeatedScalarFieldContainer[_builtins.str]:
         """Robots: services that its configuration names and servers that it knows of offer, none of which it reaches."""
 
+    @_builtins.property
+    def faults(self) -> _containers.RepeatedCompositeFieldContainer[Global___InterfaceFault]:
+        """Robots: what is wrong with interfaces that carry something, at most one entry for each fault of each."""
+
     def __init__(
         self,
         *,
@@ -347,14 +379,40 @@ class SidecarStatus(_message.Message):
         unanswered: _abc.Iterable[Global___UnansweredService] | None = ...,
         untyped: _abc.Iterable[_builtins.str] | None = ...,
         unreached: _abc.Iterable[_builtins.str] | None = ...,
+        faults: _abc.Iterable[Global___InterfaceFault] | None = ...,
     ) -> None: ...
     _HasFieldArgType: _TypeAlias = _typing.Literal["mapping", b"mapping", "peer", b"peer", "peers", b"peers", "revocations", b"revocations"]  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["abridged", b"abridged", "connected", b"connected", "down", b"down", "lease_left_us", b"lease_left_us", "mapping", b"mapping", "paths", b"paths", "peer", b"peer", "peers", b"peers", "refused_offers", b"refused_offers", "revocations", b"revocations", "services", b"services", "software_version", b"software_version", "unanswered", b"unanswered", "unmet", b"unmet", "unreached", b"unreached", "untyped", b"untyped", "uses", b"uses", "withdrawn", b"withdrawn"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["abridged", b"abridged", "connected", b"connected", "down", b"down", "faults", b"faults", "lease_left_us", b"lease_left_us", "mapping", b"mapping", "paths", b"paths", "peer", b"peer", "peers", b"peers", "refused_offers", b"refused_offers", "revocations", b"revocations", "services", b"services", "software_version", b"software_version", "unanswered", b"unanswered", "unmet", b"unmet", "unreached", b"unreached", "untyped", b"untyped", "uses", b"uses", "withdrawn", b"withdrawn"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     def WhichOneof(self, oneof_group: _Never) -> None: ...
 
 Global___SidecarStatus: _TypeAlias = SidecarStatus  # noqa: Y015
+
+@_typing.final
+class InterfaceFault(_message.Message):
+    DESCRIPTOR: _descriptor.Descriptor
+
+    INTERFACE_FIELD_NUMBER: _builtins.int
+    FAULT_FIELD_NUMBER: _builtins.int
+    TEXT_FIELD_NUMBER: _builtins.int
+    interface: _builtins.str
+    fault: Global___Fault.ValueType
+    text: _builtins.str
+    def __init__(
+        self,
+        *,
+        interface: _builtins.str = ...,
+        fault: Global___Fault.ValueType = ...,
+        text: _builtins.str = ...,
+    ) -> None: ...
+    _HasFieldArgType: _TypeAlias = _Never  # noqa: Y015
+    def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["fault", b"fault", "interface", b"interface", "text", b"text"]  # noqa: Y015
+    def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
+    def WhichOneof(self, oneof_group: _Never) -> None: ...
+
+Global___InterfaceFault: _TypeAlias = InterfaceFault  # noqa: Y015
 
 @_typing.final
 class UnansweredService(_message.Message):
@@ -891,6 +949,7 @@ class ExplainResponse(_message.Message):
     PREDICTED_MISS_FIELD_NUMBER: _builtins.int
     GONE_US_FIELD_NUMBER: _builtins.int
     GONE_REASON_FIELD_NUMBER: _builtins.int
+    REDUNDANCY_FIELD_NUMBER: _builtins.int
     robot: _builtins.str
     service: _builtins.str
     deadline_us: _builtins.int
@@ -912,6 +971,8 @@ class ExplainResponse(_message.Message):
     gone_us: _builtins.int
     """Present if the robot is gone: how long ago it went, and why. Everything else is as of then."""
     gone_reason: Global___DepartureReason.ValueType
+    redundancy: _types_pb2.RedundancyMode.ValueType
+    """How the robot sends copies of a request over the mapped pairs; absent from an older control plane."""
     @_builtins.property
     def mapping(self) -> _control_pb2.ServiceMapping:
         """As last sent; absent if nothing was."""
@@ -950,10 +1011,11 @@ class ExplainResponse(_message.Message):
         predicted_miss: _builtins.float | None = ...,
         gone_us: _builtins.int | None = ...,
         gone_reason: Global___DepartureReason.ValueType = ...,
+        redundancy: _types_pb2.RedundancyMode.ValueType | None = ...,
     ) -> None: ...
-    _HasFieldArgType: _TypeAlias = _typing.Literal["_cost_per_request", b"_cost_per_request", "_gone_us", b"_gone_us", "_in_force_us", b"_in_force_us", "_observed_miss", b"_observed_miss", "_predicted_miss", b"_predicted_miss", "cost_per_request", b"cost_per_request", "gone_us", b"gone_us", "in_force_us", b"in_force_us", "mapping", b"mapping", "observed_miss", b"observed_miss", "predicted_miss", b"predicted_miss", "sync", b"sync"]  # noqa: Y015
+    _HasFieldArgType: _TypeAlias = _typing.Literal["_cost_per_request", b"_cost_per_request", "_gone_us", b"_gone_us", "_in_force_us", b"_in_force_us", "_observed_miss", b"_observed_miss", "_predicted_miss", b"_predicted_miss", "_redundancy", b"_redundancy", "cost_per_request", b"cost_per_request", "gone_us", b"gone_us", "in_force_us", b"in_force_us", "mapping", b"mapping", "observed_miss", b"observed_miss", "predicted_miss", b"predicted_miss", "redundancy", b"redundancy", "sync", b"sync"]  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["_cost_per_request", b"_cost_per_request", "_gone_us", b"_gone_us", "_in_force_us", b"_in_force_us", "_observed_miss", b"_observed_miss", "_predicted_miss", b"_predicted_miss", "alternatives", b"alternatives", "changes", b"changes", "cost_per_request", b"cost_per_request", "deadline_us", b"deadline_us", "gone_reason", b"gone_reason", "gone_us", b"gone_us", "idempotent", b"idempotent", "in_force_us", b"in_force_us", "joints", b"joints", "mapping", b"mapping", "objective", b"objective", "observed_miss", b"observed_miss", "pairs", b"pairs", "pairs_left_out", b"pairs_left_out", "predicted_miss", b"predicted_miss", "robot", b"robot", "service", b"service", "sync", b"sync", "target_miss", b"target_miss"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["_cost_per_request", b"_cost_per_request", "_gone_us", b"_gone_us", "_in_force_us", b"_in_force_us", "_observed_miss", b"_observed_miss", "_predicted_miss", b"_predicted_miss", "_redundancy", b"_redundancy", "alternatives", b"alternatives", "changes", b"changes", "cost_per_request", b"cost_per_request", "deadline_us", b"deadline_us", "gone_reason", b"gone_reason", "gone_us", b"gone_us", "idempotent", b"idempotent", "in_force_us", b"in_force_us", "joints", b"joints", "mapping", b"mapping", "objective", b"objective", "observed_miss", b"observed_miss", "pairs", b"pairs", "pairs_left_out", b"pairs_left_out", "predicted_miss", b"predicted_miss", "redundancy", b"redundancy", "robot", b"robot", "service", b"service", "sync", b"sync", "target_miss", b"target_miss"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     _WhichOneofReturnType__cost_per_request: _TypeAlias = _typing.Literal["cost_per_request"]  # noqa: Y015
     _WhichOneofArgType__cost_per_request: _TypeAlias = _typing.Literal["_cost_per_request", b"_cost_per_request"]  # noqa: Y015
@@ -965,6 +1027,8 @@ class ExplainResponse(_message.Message):
     _WhichOneofArgType__observed_miss: _TypeAlias = _typing.Literal["_observed_miss", b"_observed_miss"]  # noqa: Y015
     _WhichOneofReturnType__predicted_miss: _TypeAlias = _typing.Literal["predicted_miss"]  # noqa: Y015
     _WhichOneofArgType__predicted_miss: _TypeAlias = _typing.Literal["_predicted_miss", b"_predicted_miss"]  # noqa: Y015
+    _WhichOneofReturnType__redundancy: _TypeAlias = _typing.Literal["redundancy"]  # noqa: Y015
+    _WhichOneofArgType__redundancy: _TypeAlias = _typing.Literal["_redundancy", b"_redundancy"]  # noqa: Y015
     @_typing.overload
     def WhichOneof(self, oneof_group: _WhichOneofArgType__cost_per_request) -> _WhichOneofReturnType__cost_per_request | None: ...
     @_typing.overload
@@ -975,5 +1039,7 @@ class ExplainResponse(_message.Message):
     def WhichOneof(self, oneof_group: _WhichOneofArgType__observed_miss) -> _WhichOneofReturnType__observed_miss | None: ...
     @_typing.overload
     def WhichOneof(self, oneof_group: _WhichOneofArgType__predicted_miss) -> _WhichOneofReturnType__predicted_miss | None: ...
+    @_typing.overload
+    def WhichOneof(self, oneof_group: _WhichOneofArgType__redundancy) -> _WhichOneofReturnType__redundancy | None: ...
 
 Global___ExplainResponse: _TypeAlias = ExplainResponse  # noqa: Y015

@@ -75,7 +75,7 @@ from plr.protos.model.report import (
     PenaltyReport,
     Report,
 )
-from plr.protos.model.status import ResourceStatus, SidecarStatus, SyncState
+from plr.protos.model.status import Fault, InterfaceFault, ResourceStatus, SidecarStatus, SyncState
 from plr.protos.model.stream import Ack, ControlMessage, Drain, Heartbeat, Nack, ResourceKind, SidecarMessage, Welcome
 
 T = TypeVar("T")
@@ -320,6 +320,7 @@ statuses = st.builds(
     _tuples(service_names),
     revocation_sets,
     _tuples(service_names),
+    faults=_tuples(st.builds(InterfaceFault, interface_names, st.sampled_from(Fault), texts)),
 )
 
 beliefs = st.tuples(probabilities, probabilities, probabilities).map(lambda three: Belief(three[0], *sorted(three[1:])))
@@ -405,4 +406,5 @@ explanations = st.builds(
     _tuples(explained_joints),
     _tuples(alternatives),
     _tuples(st.builds(MappingChange, durations, versions, service_mappings())),
+    st.none() | st.sampled_from(RedundancyMode),
 )

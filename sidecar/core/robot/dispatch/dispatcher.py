@@ -175,20 +175,9 @@ class Dispatching:
         return self._send(request, path, now, _Why.HEDGE)
 
     def ask_another_server(self, request: Request, now: float) -> None:
-        """Ask another server, also over the same interface, if the only one asked has the request and is silent.
-
-        Of a shared request it may also have too little by now.
-        """
-        if request.rule.idempotent and (request.waits_for_one_server() or self._falls_behind(request, now)):
+        """Ask another server, also over the same interface, if the only one asked has the request and is silent."""
+        if request.rule.idempotent and request.waits_for_one_server():
             self.rescue(request, now, insist=True)
-
-    def _falls_behind(self, request: Request, now: float) -> bool:
-        """Return whether a shared request will be late if it goes on arriving as it did so far."""
-        if not MODES[request.rule.redundancy].shares:
-            return False
-        passed = (now - request.submitted_at) / request.rule.deadline_s
-        carried = [copy.message.newest.symbols for copy in request.relied_on()]
-        return all(symbols.arrived < passed * symbols.count for symbols in carried)
 
     def rescue(self, request: Request, now: float, *, insist: bool = False, rejected: bool = False) -> None:
         """Send one more copy when no copy that is relied on is on a path that is up (or when `insist`).
@@ -224,7 +213,11 @@ class Dispatching:
 
     def _is_on_its_way(self, copy: Copy) -> bool:
         """Return whether its server may not have all of it yet because its path is slow but not silent."""
-        return not copy.message.newest.is_there and self._parts.routes.best_state(copy.paths) is PathState.UP
+        return not copy.message.newest.is_there and self._is_reached(copy)
+
+    def _is_reached(self, copy: Copy) -> bool:
+        """Return whether a path that carries it is up."""
+        return self._parts.routes.best_state(copy.paths) is PathState.UP
 
     def _try_another_server(self, request: Request, slow: Copy, now: float) -> None:
         """Share a request with another server as well, if it is time to find out whether one is better."""
@@ -297,28 +290,34 @@ class Dispatching:
         if not copy.shared_by:
             self._paces.answered(request.service, copy.path, latency_s, processing_s, now)
         if MODES[request.rule.redundancy].shares and not request.races:
-            self._favourites.answered(request.service, copy, request.relied_on())
+            self._favourites.answered(request.service, copy, request.relied_on(), request.rule.deadline_s, now)
 
     def ended(self, request: Request, now: float) -> None:
         """Note the outcome of the copies, once for each request: all are known, or the deadline is over."""
         self.records.note(request, now)
-        if MODES[request.rule.redundancy].shares and not request.rule.idempotent:
-            self._leave_silent_server(request, now)
+        if MODES[request.rule.redundancy].shares:
+            self._judge_favourite(request, now)
         if self._budgets.limit and any(copy.in_time for copy in request.copies):
             paths = (*request.withheld, *(copy.path for copy in request.copies))
             self._budgets.earn(request.copies[0].message.symbols.total, {path.interface for path in paths})
 
-    def _leave_silent_server(self, request: Request, now: float) -> None:
-        """Let the next requests go to another server after a missed one, which itself must not run twice."""
-        service = request.service
-        for copy in request.relied_on():
-            up = self._parts.routes.best_state(copy.paths) is PathState.UP
-            if up and self._favourites.may_leave(service, copy.path.peer, now):
-                servers = self._favoured(self._parts.offers.servers(service), now)
-                other = self._favourites.other(service, copy.path.peer, servers, copy.paths)
-                if other is not None:
-                    self._favourites.tried(service, now)
-                    self._favourites.move(service, other)
+    def _judge_favourite(self, request: Request, now: float) -> None:
+        """Count a missed deadline of the only server asked, to which a path is up.
+
+        If the request must not run twice, let the next ones go elsewhere in place of this one.
+        """
+        waiting = request.relied_on()
+        if len(request.asked()) > 1 or not any(self._is_reached(copy) for copy in waiting):
+            return
+        service, paths = request.service, waiting[0].paths
+        server = waiting[0].path.peer
+        self._favourites.missed(service, server)
+        if request.rule.idempotent or not self._favourites.may_try(service, now):
+            return
+        other = self._favourites.other(service, server, self._favoured(self._parts.offers.servers(service), now), paths)
+        if other is not None:
+            self._favourites.tried(service, now)
+            self._favourites.move(service, other)
 
     def _send(
         self,

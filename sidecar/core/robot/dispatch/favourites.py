@@ -1,10 +1,10 @@
 """Robot side: remembers the server to which shared requests of each service go, and when another one is tried.
 
 Shared requests stay at one server while it answers. Another one would begin with paths about which less is known, over
-the same networks. A server may be bad although its paths are up: its own network is slow, or it answers nothing. Only a
-request that also goes to another server shows this: the favourite had a head start, so whoever answers first is better.
-Under overload no server is better, and such a request takes capacity from others. So the time between two tries doubles
-with each try that is not answered by the deadline.
+the same networks. A server may be bad although its paths are up: its own network is slow, or it answers nothing. So
+after some missed deadlines in a row, a late request also goes to another server. The favourite had a head start, so
+whoever answers first is better. Under overload no server is better, and the paths to another one take capacity from
+those in use. So the time between two tries doubles with each try that is not answered by its deadline.
 """
 
 from __future__ import annotations
@@ -21,6 +21,8 @@ if TYPE_CHECKING:
     from plr.sidecar.core.robot.request.request import Copy
     from plr.sidecar.core.transfer.routes import Routes
 
+MISSES = 8
+"""Another server is tried after so many missed deadlines in a row: under overload, some requests are in time."""
 FIRST_WAIT_S = 0.25
 """The second try of another server comes this long (s) after the first, which comes at once ..."""
 LONGEST_WAIT_S = 8.0
@@ -32,6 +34,8 @@ class _Favourite:
     server: NodeName
     chosen: bool = False
     """It took the place of another one, and keeps it although the mapping may not name it."""
+    misses: int = 0
+    """Missed deadlines since the last answer in time."""
     next_try_at: float = 0.0
     wait_s: float = FIRST_WAIT_S
 
@@ -84,38 +88,44 @@ class Favourites:
         best = [up[0] for server in servers if (up := self._mapping.up_to(server, paths))]
         return min(best, key=self._routes.rtt).peer if best else None
 
-    def may_try(self, service: ServiceName, now: float) -> bool:
-        """Return whether a request that its server may not answer in time may go to another one as well."""
+    def missed(self, service: ServiceName, server: NodeName) -> None:
+        """Note that a request missed its deadline while it was only at this server, and the path to it is up."""
         favourite = self._favourites.get(service)
-        return favourite is None or now >= favourite.next_try_at
+        if favourite is not None and favourite.server == server:
+            favourite.misses += 1
 
-    def may_leave(self, service: ServiceName, server: NodeName, now: float) -> bool:
-        """Return whether this is the favourite, and the next requests may go to another one."""
+    def may_try(self, service: ServiceName, now: float) -> bool:
+        """Return whether it is time to find out whether another server is better than the favourite."""
         favourite = self._favourites.get(service)
-        return favourite is not None and favourite.server == server and now >= favourite.next_try_at
+        return favourite is not None and favourite.misses >= MISSES and now >= favourite.next_try_at
 
     def tried(self, service: ServiceName, now: float) -> None:
         """Note that a request went to another server as well, or in place of the favourite."""
-        favourite = self._favourites.get(service)
-        if favourite is None:
-            return
+        favourite = self._favourites[service]
         if now > favourite.next_try_at + LONGEST_WAIT_S:
             favourite.wait_s = FIRST_WAIT_S  # what did not help before may help today
         favourite.next_try_at = now + favourite.wait_s
         favourite.wait_s = min(2.0 * favourite.wait_s, LONGEST_WAIT_S)
 
-    def answered(self, service: ServiceName, copy: Copy, others: Iterable[Copy]) -> None:
-        """Note which copy of a request was answered first; the `others` are still awaited."""
+    def answered(self, service: ServiceName, copy: Copy, others: Iterable[Copy], deadline_s: float, now: float) -> None:
+        """Note which copy of a request was answered first; the `others` are still awaited.
+
+        A server that takes longer than the service's deadline (s) is no better than the favourite.
+        """
         favourite = self._favourites.get(service)
-        if favourite is None or favourite.server == copy.path.peer:
+        if favourite is None:
             return
-        if any(other.path.peer == favourite.server and other.sent_at < copy.sent_at for other in others):
-            self.move(service, copy.path.peer)
-        if copy.in_time:
-            favourite.next_try_at, favourite.wait_s = 0.0, FIRST_WAIT_S
+        server = copy.path.peer
+        if now - copy.sent_at > deadline_s:
+            return
+        if favourite.server != server and any(
+            other.path.peer == favourite.server and other.sent_at < copy.sent_at for other in others
+        ):
+            self.move(service, server)
+        if copy.in_time and favourite.server == server:
+            favourite.misses, favourite.next_try_at, favourite.wait_s = 0, 0.0, FIRST_WAIT_S
 
     def move(self, service: ServiceName, to: NodeName) -> None:
         """Make another server the favourite."""
-        favourite = self._favourites.get(service)
-        if favourite is not None:
-            favourite.server, favourite.chosen = to, True
+        favourite = self._favourites[service]
+        favourite.server, favourite.chosen, favourite.misses = to, True, 0

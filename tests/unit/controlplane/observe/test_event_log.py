@@ -197,6 +197,21 @@ def test_what_was_left_out_of_a_members_share_is_said(tmp_path: Path) -> None:
     assert f"and {left_out} earlier events" in log.events()[-1].text
 
 
+def test_refusals_under_a_name_are_told_seldom_and_take_nothing_of_its_owner() -> None:
+    now = 0.0
+    log = EventLog(None, clock=lambda: now)
+    for _ in range(1000):
+        log.record_refusal(ROBOT, "NAME_TAKEN", "registration: taken")
+    assert [event.text for event in log.events()] == ["registration: taken"]
+    assert log.state.too_often == 999
+    log.record(EventKind.NACK, ROBOT, "no", role=Role.ROBOT)
+    assert log.events()[-1].text == "no"
+    now = 61.0
+    log.record_refusal(ROBOT, "NAME_TAKEN", "registration: taken")
+    assert log.events()[-1].text == "registration: taken (and 999 earlier times that were too many to keep)"
+    assert log.events()[-1].kind is EventKind.REFUSED
+
+
 @pytest.mark.skipif(os.geteuid() != 0, reason="mounting takes root")
 @pytest.mark.parametrize("lock", [True, False])
 def test_a_folder_that_was_read_only_at_the_start_is_read_and_written_once_it_can_be(

@@ -18,6 +18,7 @@ from plr.controlplane.core.estimate.fading import FadedHistogram
 from plr.controlplane.core.estimate.network import ReportedPath
 from plr.controlplane.core.estimate.unanswered import LATELY_S
 from plr.controlplane.core.explain.departed import Departure
+from plr.controlplane.core.explain.faults import FLAPS, LOOK_EVERY_S
 from plr.controlplane.core.explain.fleet_view import MAX_VIEWED, InterfaceView, MemberView, MissView, ServedView
 from plr.controlplane.core.policy.policy import CallRule, OfferRule, Policy
 from plr.controlplane.core.registry.registry import Refusal
@@ -115,6 +116,31 @@ def test_an_interface_that_carries_nothing_is_reported_and_its_paths_are_not() -
     assert (status.down, status.abridged) == (("wwan0", "eth0"), False)
     assert [one.interface for one in status.paths] == ["wlan0"]
     assert "wwan0 DOWN" in render([status])
+
+
+def test_a_flapping_interface_and_a_restless_server_are_exported() -> None:
+    world = World(Settings(warm_up_s=0.0))
+    world.cloud("a")
+    world.cloud("b")
+    robot = world.robot()
+    for number in range(1 + FLAPS):
+        up = number % 2 == 0
+        world.say(robot, Report(paths=(path("wlan0", "a"), path("wwan0", "a", up=up))))
+        world.run(LOOK_EVERY_S)
+    found = series(families(fleet_of(world)))
+    wlan, wwan = ({"robot": "robot", "interface": nic} for nic in ("wlan0", "wwan0"))
+    assert value(found, "plr_robot_interface_changes_total", **wlan) == 0.0
+    assert value(found, "plr_robot_interface_changes_total", **wwan) == FLAPS
+    assert value(found, "plr_robot_interface_fault", fault="flapping", **wlan) == 0.0
+    assert value(found, "plr_robot_interface_fault", fault="flapping", **wwan) == 1.0
+    assert value(found, "plr_robot_interface_fault", fault="useless", **wwan) == 0.0
+    for number in range(2 + FLAPS):
+        both = [path(nic, "b", up=number % 2 == 0) for nic in ("wlan0", "wwan0")]
+        world.say(robot, Report(paths=(*both, path("wlan0", "a"), path("wwan0", "a"))))
+        world.run(LOOK_EVERY_S)
+    found = series(families(fleet_of(world)))
+    assert value(found, "plr_server_robots", server="a", path="restless") == 0.0
+    assert value(found, "plr_server_robots", server="b", path="restless") == 1.0
 
 
 def test_nobody_is_told_which_interfaces_carry_nothing() -> None:
@@ -491,7 +517,7 @@ def fleet(robots: list[MemberView], *, gone: int = 0, clouds: int = 5, services:
     return Fleet(members, left, {member.name: 1.0 for member in members}, 0.0, 0.0)
 
 
-@pytest.mark.parametrize(("services", "expected"), [(1, 50_041), (4, 77_071)])
+@pytest.mark.parametrize(("services", "expected"), [(1, 59_046), (4, 86_076)])
 def test_a_thousand_robots_take_as_many_series_as_documented(services: int, expected: int) -> None:
     robots = [robot_view(f"robot-{number}", 3, 5, services) for number in range(1000)]
     found = series(families(fleet(robots, services=services)))
@@ -505,7 +531,7 @@ def test_series_are_bounded_and_one_robot_takes_none_of_others() -> None:
     found = series(families(fleet([greedy, *robots], gone=MAX_GONE_WITH_SERIES)))
     assert len(found) <= MAX_SERIES + 1
     of_robot = Counter(dict(labels).get("robot") for _, labels in found)
-    assert {of_robot[f"robot-{number}"] for number in range(999)} == {74}
+    assert {of_robot[f"robot-{number}"] for number in range(999)} == {83}
     assert of_robot["greedy"] < 100
     assert (value(found, "plr_fleet_series_left_out") or 0.0) > 1000.0
 

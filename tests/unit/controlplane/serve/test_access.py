@@ -2,9 +2,36 @@
 
 from __future__ import annotations
 
+import asyncio
+
 import pytest
 
-from plr.controlplane.serve.access import CALLS_BURST, CALLS_PER_S, LONGEST_WAIT_S, CallRates
+from plr.controlplane.serve import access
+from plr.controlplane.serve.access import CALLS_BURST, CALLS_PER_S, LONGEST_WAIT_S, CallRates, first_words
+
+
+class Context:
+    """One call's; the client sends its first message after a while, or never."""
+
+    def __init__(self, delay_s: float | None) -> None:
+        self._delay_s = delay_s
+        self.read_it = False
+
+    async def read(self) -> bytes:
+        await asyncio.sleep(3600.0 if self._delay_s is None else self._delay_s)
+        self.read_it = True
+        return b"words"
+
+
+@pytest.mark.parametrize(("delay_s", "arrives"), [(0.0, True), (0.01, True), (None, False)])
+def test_the_first_message_of_a_refused_call_is_awaited_but_not_for_ever(
+    monkeypatch: pytest.MonkeyPatch, delay_s: float | None, arrives: bool
+) -> None:
+    if not arrives:
+        monkeypatch.setattr(access, "FIRST_WORDS_S", 0.01)
+    context = Context(delay_s)
+    asyncio.run(first_words(context))
+    assert context.read_it == arrives
 
 
 @pytest.mark.audit("ops-16")

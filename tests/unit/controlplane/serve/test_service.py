@@ -38,6 +38,9 @@ class Loop:
         mailbox.put(PeerSet(Version(1), nonce=1))
         return 7, mailbox
 
+    def refuse(self, *_: object) -> None:
+        pass
+
     def stream_ended(self, *_: object) -> None:
         pass
 

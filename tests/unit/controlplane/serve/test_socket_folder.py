@@ -27,6 +27,12 @@ with socket_folder() as folder:
 """
 
 
+@pytest.fixture
+def tmp_path(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Short, since the path of a socket has at most 107 bytes."""
+    return tmp_path_factory.mktemp("s")
+
+
 @pytest.fixture(autouse=True)
 def own_tmp(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))

@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 import pytest
 from scipy.stats import beta
 
-from plr.controlplane.core.estimate.beta import intervals, quantiles
+from plr.controlplane.core.estimate.beta import interval_steps, intervals, quantiles
 from plr.controlplane.core.estimate.posterior import Estimate
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
 
 
 @pytest.mark.parametrize("share", [0.05, 0.5, 0.95])
@@ -23,6 +28,18 @@ def test_an_interval_holds_what_it_says() -> None:
         inside = beta.cdf(high, estimate.misses, estimate.hits) - beta.cdf(low, estimate.misses, estimate.hits)
         assert inside == pytest.approx(0.9)
         assert low < estimate.mean < high
+
+
+def test_many_intervals_take_many_steps() -> None:
+    rng = np.random.default_rng(7)
+    estimates = [Estimate(*(10 ** rng.uniform(-2, 3, 2))) for _ in range(500)]
+    found: list[list[tuple[float, float]]] = []
+
+    def steps() -> Iterator[None]:
+        found.append((yield from interval_steps(estimates, 0.9)))
+
+    assert len(list(steps())) > 20
+    assert found == [intervals(estimates, 0.9)]
 
 
 def test_of_none_there_are_none() -> None:

@@ -8,6 +8,7 @@ from plr.controlplane.core.explain.event_memory import (
     EVENTS_BURST,
     EVENTS_PER_S,
     MAX_EVENTS,
+    MAX_REFUSALS,
     PRESENCE_BURST,
     EventMemory,
 )
@@ -54,6 +55,28 @@ def test_a_member_has_its_share_and_the_control_plane_is_not_counted() -> None:
     assert sum(memory.admits("flapping", 10.0, presence=True) for _ in range(100)) == PRESENCE_BURST
     assert memory.admits("another", 10.0)
     assert memory.admits("flapping", 10.0 + 1.0 / EVENTS_PER_S)
+
+
+def test_refusals_push_out_nothing_of_members() -> None:
+    memory = EventMemory()
+    members = [event(number, f"robot-{number}") for number in range(1, MAX_EVENTS - MAX_REFUSALS + 1)]
+    for one in members:
+        memory.add(one)
+    first = memory.last_number + 1
+    for number in range(first, first + 4 * MAX_EVENTS):
+        memory.add(FleetEvent(number, 0.0, EventKind.REFUSED, NodeName(f"stranger-{number}")))
+    assert [one for one in memory if one.kind is not EventKind.REFUSED] == members
+    assert len(memory) == MAX_EVENTS
+    assert memory.evicted == 4 * MAX_EVENTS - MAX_REFUSALS
+
+
+def test_the_name_with_most_refusals_loses_its_oldest() -> None:
+    memory = EventMemory()
+    memory.add(FleetEvent(1, 0.0, EventKind.REFUSED, NodeName("seldom")))
+    for number in range(2, 2 + 2 * MAX_REFUSALS):
+        memory.add(FleetEvent(number, 0.0, EventKind.REFUSED, NodeName("often")))
+    assert next(iter(memory)).node == "seldom"
+    assert len(memory) == MAX_REFUSALS
 
 
 def test_the_last_ones_come_the_oldest_first() -> None:

@@ -27,12 +27,12 @@ from plr.controlplane.core.formulation.problem_builder import (
     is_alike,
 )
 from plr.controlplane.core.policy.path_rules import PathRule, PathRules
-from plr.controlplane.core.policy.permits import Permits
+from plr.controlplane.core.policy.permits import Group, Permits
 from plr.controlplane.core.policy.policy import CallRule, OfferRule, Policy
 from plr.controlplane.core.problem.problem import Block, BlockKey, Objective
 from plr.controlplane.core.registry.registry import Sidecar
 from plr.protos.model.ids import InterfaceName, NodeName, Role, ServiceName
-from plr.protos.model.members import InterfaceLabel, ServiceOffer, ServiceSet
+from plr.protos.model.members import CallPermit, InterfaceLabel, ServiceOffer, ServiceSet
 from plr.protos.model.report import Report
 from tests.support.samples import PLAN, histogram, interfaces, latency, offer, path, registration, stream, use
 
@@ -418,6 +418,47 @@ def test_a_large_fleet_is_looked_at_in_several_goes() -> None:
     assert {note.unserved for note in fleet.drawing.picture().notes.values()} == {
         "the access policy lets this robot call it on no live server"
     }
+
+
+def test_under_a_policy_with_a_rule_for_each_robot_few_clouds_are_asked_in_one_go(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    clouds, robots = 50 * problem_builder.CLOUDS_A_LOOK, 20
+    fleet = Fleet(robots)
+    fleet.sidecars[:2] = [
+        replace(fleet._cloud(f"cloud-{number:04d}"), offered=frozenset((ServiceName(PLAN),)))
+        for number in range(clouds)
+    ]
+    rules = tuple(CallRule((name,), ("*",), ("*",)) for name in fleet.names)
+    fleet.permits = Permits(Policy(rules, (OfferRule(("*",), ("*",)),)))
+    asked, read, real = 0, 0, Permits.of
+    inputs = problem_builder._inputs
+
+    def of(permits: Permits, group: Group, cloud: Sidecar) -> CallPermit:
+        nonlocal asked
+        asked += 1
+        return real(permits, group, cloud)
+
+    def counted(*given: Any) -> problem_builder._Inputs:
+        nonlocal read
+        read += len(given[-1])
+        return inputs(*given)
+
+    monkeypatch.setattr(Permits, "of", of)
+    monkeypatch.setattr(problem_builder, "_inputs", counted)
+    fleet.drawing.members_changed()
+    fleet.drawing.begin(routine=False)
+    goes = 0
+    while fleet.drawing._frame is None:
+        before = asked + read
+        fleet.drawing.advance(fleet.sidecars, fleet.permits, fleet.estimator, fleet.now)
+        # The clouds of one use may come on top.
+        most = problem_builder.LOOKED_AT_ONCE * problem_builder.CLOUDS_A_LOOK + clouds
+        assert asked + read - before <= most
+        goes += 1
+    assert asked == read == robots * clouds
+    assert goes > 5
+    assert fleet.drawing._outdated == {}
 
 
 @pytest.mark.audit("ops-19")
