@@ -92,8 +92,8 @@ class ControlPlaneConfig(Section):
     the interval, too. A lease lasts for at least three intervals. A changed path or a missed deadline is reported at
     once."""
     warm_up_ms: Annotated[int, Field(ge=0, le=600_000)] = RECONNECT_MAX_MS + 2000
-    """Longest time after a start for which the control plane waits for servers to return. Until then, a robot that
-    still holds peers gets no set of peers that lacks one of its servers."""
+    """Longest time after a start for which the control plane waits for servers to return. During this time, a
+    robot that still holds peers does not get a set of peers in which one of its servers is missing."""
     histogram_half_life_s: Annotated[float, Field(ge=1.0, le=86_400.0)] = 60.0
     """Half-life of the latency samples. It is also the half-life of misses in the longest of the memories from which
     misses are predicted. With a shorter half-life, the mapping follows changes sooner, but it rests on fewer
@@ -119,7 +119,7 @@ class ControlPlaneConfig(Section):
     that no rule matches is allowed. The rules are for planning, not for protection. For protection, use `policy`."""
     policy: Annotated[PolicyConfig | None, BeforeValidator(_empty_if_null)] = None
     """Access control. Without this key, everything is allowed. With this key, everything that no rule allows is denied.
-    This also holds for a key with nothing after it."""
+    An empty `policy:` therefore denies everything."""
     log_level: Literal["debug", "info", "warning", "error"] = "info"
     """Lowest level that is logged to stderr."""
 

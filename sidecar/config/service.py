@@ -150,13 +150,14 @@ class ServiceConfig(Section):
     symbol without another round trip.
 
     - `auto`: no repair symbols while no loss is measured. A message of 150 kB gets about 11 % more at 2 % loss, and 17
-      % more at 5 % loss. It gets at most half more.
+      % more at 5 % loss. The maximum is 50 % more.
     - `off`: no repair symbols. Lost datagrams are sent again.
     - A number: always this share.
 
-    From 0.5 % loss on, the sidecar sends some datagrams twice, also with `off`. No repair symbol covers these
-    datagrams, and a further loss would cost another round trip. They are the last datagram of a message (the only one
-    of a short message), and the few datagrams that are sent again."""
+    The sidecar sends some datagrams twice, also with `off`: the last datagram of a message (the only one of a short
+    message), and datagrams that are sent again, if they are few. No repair symbol covers these datagrams, and their
+    loss would cost another round trip. They are sent twice if the probability that one of them is lost is at least
+    0.5 %."""
     priority: Annotated[PriorityWord, converted, _ROBOT] = PriorityWord.NORMAL
     """Requests and answers of a service with a higher priority go before those with a lower one. This holds on the
     robot's paths, on the way back, and in the server's queue. Use `high` for small, urgent requests. Use `low` for bulk
@@ -169,8 +170,8 @@ class ServiceConfig(Section):
     - `backup`: the best pair. The next pair follows as soon as the path of the best one is unstable or down, or loses
       the request.
     - `hedge`: the best pair. The next pair follows when the answer takes long. Only for idempotent services.
-    - `adaptive`: one pair. Others follow if the progress of the first copy endangers the deadline, as late as
-      `target_miss` allows. Only for idempotent services.
+    - `adaptive`: one pair. Others follow if the first copy makes so little progress that it may miss the deadline. They
+      are sent as late as `target_miss` allows. Only for idempotent services.
     - `share`: all mapped interfaces together carry one copy to one server. Each carries as much as it can. Spare
       capacity repeats what other interfaces carry.
     - `replicate`: all pairs at once. `copies` sets how many interfaces are mapped."""
@@ -180,9 +181,9 @@ class ServiceConfig(Section):
     """With `redundancy: hedge` only. The next copy is sent when the answer takes longer than this share of the recent
     answers over the same pair. It is sent at half of the deadline at the latest."""
     repeats: Annotated[float, Field(ge=0, le=1), _ROBOT] = DEFAULT_REPEATS
-    """With `redundancy: share` only. Interfaces with spare capacity repeat up to this share of the request that other
-    interfaces carry. With 1, an interface that fails costs no time. With 0, nothing is sent twice. If an interface then
-    fails, its part of the request is missing until the sidecar notices the failure."""
+    """With `redundancy: share` only. Interfaces with spare capacity repeat what other interfaces carry, up to this
+    share of the request. With 1, an interface that fails costs no time. With 0, nothing is sent twice. If an interface
+    then fails, its part of the request is missing until the sidecar notices the failure."""
     copies: Annotated[CopiesWanted | None, _ROBOT] = None
     """Over how many interfaces the control plane maps copies of a request.
 

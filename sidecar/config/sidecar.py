@@ -148,8 +148,8 @@ class SidecarConfig(Section):
     state_dir: Annotated[AbsolutePath, converted] = Path("/var/lib/plr")
     """Folder for the sidecar's identity, and for the last good peers and mapping. Each sidecar needs its own folder.
     The sidecar creates a missing folder. The folder, the folders above it, and symbolic links in its path must belong
-    to root or to the sidecar's user. If the folder is lost, the sidecar cannot start without a control plane. It cannot
-    register its name either until the old lease ends."""
+    to root or to the sidecar's user. If the folder is lost, the sidecar needs the control plane to start. It
+    can register its name only after its old lease has ended."""
     max_revocation_age_s: Annotated[int | None, Field(ge=60, le=365 * 86_400)] = None
     """Maximum age of a CA's newest revocation list. The sidecar does not talk to peers whose CA has signed no list
     within this time. It judges by the lists that it has received, and by its own clock. This key requires `tls_dir`.
