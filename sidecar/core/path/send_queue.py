@@ -197,8 +197,9 @@ class SendQueue:
                 each.passed_over = max(0, each.passed_over - SHARE * symbols) if each is not waiting[0] else 0
                 higher = False
                 continue
-            if each.fresh:
-                each.fresh[0][2].waits()  # the other paths must not rely on this one for it
+            for heap in each.heaps:
+                if heap:
+                    heap[0][2].waits()  # the other paths must not rely on this one for it
             if not higher:
                 each.passed_over = min(each.passed_over + symbols, SHARE * MAX_RUN)
 

@@ -215,8 +215,9 @@ def test_messages_that_are_over_stay_in_memory_for_a_moment_only() -> None:
     assert len(second) == 1, "although the other one goes on"
 
 
-def test_a_path_busy_with_a_higher_priority_offers_nothing_for_a_lower_one() -> None:
-    low = message(1, 12_000, deadline=5.0, repeats=0.0, priority=Priority.LOW)
+@pytest.mark.parametrize("deadline", [5.0, 0.05, -1.0])
+def test_a_path_busy_with_a_higher_priority_offers_nothing_for_a_lower_one(deadline: float) -> None:
+    low = message(1, 12_000, deadline=deadline, expires=20.0, repeats=0.0, priority=Priority.LOW)
     first, second = both(low)
     first.add(message(2, 120_000, deadline=5.0, priority=Priority.HIGH))
     for _ in range(3):
