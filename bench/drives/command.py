@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 from rich.console import Console
 from rich.progress import Progress
 
-from bench.drives.contenders import COMPUTED, CONTENDERS
+from bench.drives.contenders import COMPUTED, CONTENDERS, FIFO_ALONE
 from bench.drives.contenders import run as run_one
 from bench.drives.targets import TARGETS, figures
 from bench.drives.windows import NAMES, Half, windows
@@ -60,6 +60,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--out", type=Path, default=Path("bench/results"), help="folder for drives.json (default %(default)s)"
     )
+    parser.add_argument("--alone", action="store_true", help="compare each path by itself with FIFO")
     parser.add_argument("--write-before", action="store_true", help=f"keep {REPLICATE}'s figures as those of before")
     for name in ("rate_hz", "request_bytes", "deadline_ms"):
         parser.add_argument(f"--{name.replace('_', '-')}", type=float, help=f"{name} in place of the usual one")
@@ -80,7 +81,10 @@ def run(options: argparse.Namespace) -> int:
     if not chosen:
         console.print(f"no window: --traces has to name a folder with traces called {NAMES}")
         return 2
-    contenders = tuple(dict.fromkeys(options.contender or (*DEFAULT, options.ours)))
+    usual = [*DEFAULT, options.ours]
+    if options.alone:
+        usual = [name for path, fifo in FIFO_ALONE.items() for name in (fifo, f"{options.ours}-{path}")]
+    contenders = tuple(dict.fromkeys(options.contender or usual))
     runs = _run_all(chosen, contenders, options.jobs, console)
     before = _before() if traffic == TRAFFIC else {}
     if options.write_before:

@@ -15,12 +15,14 @@ if TYPE_CHECKING:
 
 FIFO = "ideal"
 CLAIRVOYANT = ideal.ORACLE
+FIFO_ALONE = {path: f"{FIFO}-{path}" for path in ("a", "b")}
+"""One first-in-first-out path."""
 COMPUTED = (FIFO, *(kind.value for kind in Causal), CLAIRVOYANT)
 """Oracles: nothing of ours runs."""
 MODES = {f"plr-{mode.value}": mode for mode in RedundancyMode}
-ALONE = {f"{name}-{path}": (mode, path) for name, mode in MODES.items() for path in ("a", "b")}
+ALONE = {f"{name}-{path}": (mode, path) for name, mode in MODES.items() for path in FIFO_ALONE}
 """One mode on one path alone."""
-CONTENDERS = (*COMPUTED, *MODES, *ALONE)
+CONTENDERS = (*COMPUTED, *FIFO_ALONE.values(), *MODES, *ALONE)
 
 
 def run(scenario: Scenario, contender: str) -> Outcome:

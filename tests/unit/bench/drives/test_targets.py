@@ -59,5 +59,16 @@ def test_the_worst_clean_window_counts() -> None:
     assert found["clean_bytes_over_single"] == 900 / 800
 
 
+def test_each_path_alone_is_compared_with_a_fifo_one() -> None:
+    def window(ours: list[float | None], fifo: list[float | None]) -> dict[str, Outcome]:
+        return {"ours-a": outcome("ours-a", ours), "ideal-a": outcome("ideal-a", fifo), "ideal-b": outcome("x", [9.0])}
+
+    runs = {"good": window([0.11] * 4, [0.1] * 4), "bad": window([2.0, 2.0, 0.2, 0.2], [2.0, 0.2, 0.2, 0.2])}
+    found = figures(runs, "ours", {})
+    assert found["alone_misses_over_fifo"] == 0.25
+    assert round(found["alone_p99_over_fifo"], 3) == 1.1
+    assert round(found["alone_good_p99_over_fifo"], 3) == 1.1
+
+
 def test_every_figure_has_a_target() -> None:
     assert len({target.key for target in TARGETS}) == len(TARGETS)
