@@ -58,9 +58,7 @@ def figures(runs: Runs, ours: str, before: Mapping[str, Figures]) -> dict[str, f
     misses = {name: of[ours].figures().misses for name, of in runs.items() if ours in of}
     shared = {name: of[Causal.SHARED.value].figures().misses for name, of in runs.items() if Causal.SHARED.value in of}
     replicated = {name: before[name].misses for name in runs.keys() & before.keys()}
-    attainable = {
-        name: of for name, of in replicated.items() if _best_causal(runs[name]) <= ATTAINABLE * of
-    }
+    attainable = {name: of for name, of in replicated.items() if _best_causal(runs[name]) <= ATTAINABLE * of}
     for key, anchor in (
         ("misses_over_causal_shared", shared),
         ("misses_over_replicate_before", replicated),
