@@ -180,7 +180,7 @@ def _modes(outcomes: Sequence[Outcome]) -> list[Section]:
     shared = pool(by_window(outcomes), (*DIRECT, *MODES), NEEDED)
     beside = mode_costs(figures_by_window(run for runs in shared.runs.values() for run in runs)) if shared else {}
     drawn = (charts.modes("modes", beside),) if beside else ()
-    about = "How many misses further copies avoid, and how many bytes they cost."
+    about = "Extra copies avoid misses and cost bytes: how many of each."
     return [Section("Redundancy modes", about, drawn, (modes_table(costs),))] if costs else []
 
 
