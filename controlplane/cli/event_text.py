@@ -16,8 +16,14 @@ if TYPE_CHECKING:
 SHOWN = 20
 """Departed sidecars shown in the text of a status."""
 
+KEPT = (
+    "lease_expired: peers may keep such a sidecar, and requests go on without the control plane; plr doctor on a peer "
+    "says whether it is reached"
+)
+"""What the control plane cannot know of a sidecar that it does not hear."""
+
 WORDS = {
-    Why.LEASE_EXPIRED: "silent for longer than its lease",
+    Why.LEASE_EXPIRED: "not heard by the control plane for longer than its lease",
     Why.CERTIFICATE_EXPIRED: "its certificate has expired",
     Why.REVOKED: "its certificate is revoked",
     Why.DRAINED: "it was stopped",
@@ -55,6 +61,8 @@ def departed(gone: Sequence[DepartedSidecar], left_out: int) -> Iterator[str]:
         for one in gone[:SHOWN]
     ]
     yield from (f"  {row}" for row in columns(rows))
+    if any(one.why is Why.LEASE_EXPIRED for one in gone[:SHOWN]):
+        yield f"  {KEPT}"
     left_out += max(0, len(gone) - SHOWN)
     if left_out:
         yield f"  and {left_out} more: plr events"

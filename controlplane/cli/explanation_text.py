@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 from plr.controlplane.cli.text_table import columns
 from plr.protos.model.explanation import AlternativeKind, Correlation
+from plr.protos.model.fleet_events import Why
 from plr.protos.model.redundancy_mode import RedundancyMode
 
 if TYPE_CHECKING:
@@ -50,8 +51,10 @@ def render(explanation: Explanation) -> str:
     lines = []
     if found.gone_s is not None:
         why = found.gone_why.value if found.gone_why is not None else "unknown"
+        # Its peers keep one whose lease expired, and may reach it.
+        whom = " for the control plane" if found.gone_why is Why.LEASE_EXPIRED else ""
         lines += [
-            f"{found.robot} IS GONE for {_age(found.gone_s)} ({why}): this shows what was known then",
+            f"{found.robot} IS GONE{whom} for {_age(found.gone_s)} ({why}): this shows what was known then",
             "",
         ]
     lines += [f"{found.robot} {found.service}: deadline {_ms(found.deadline_s)}, {kind}, {aim}"]

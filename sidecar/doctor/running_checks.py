@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 from plr.sidecar.core.path.pmtu import HEADERS_V4, HEADERS_V6, LEAST_MTU
 from plr.sidecar.core.wire.frame import BASE_BYTES
-from plr.sidecar.doctor import losses
+from plr.sidecar.doctor import losses, removed_peers
 from plr.sidecar.doctor.finding import duration, fail, milliseconds, ok, share, warn
 
 if TYPE_CHECKING:
@@ -268,6 +268,16 @@ def _no_peer(state: State) -> Finding:
     level = fail if _is_robot(state) and not _just_started(state) else warn
     told = state.get("control") or {}
     others = "cloud server" if _is_robot(state) else "robot"
+    if dormant := removed_peers.dormant(state):
+        remedy = "see the interfaces above, and run plr doctor on the peer's host"
+        if not told.get("connected"):
+            remedy += "; see control below"
+        return level(
+            "path",
+            f"no peer is reached; the control plane removed these, and this sidecar keeps them: {dormant}. It talks to "
+            "each as soon as a path answers",
+            f"{remedy}. Do not restart this sidecar: it would forget them. {removed_peers.SEE}",
+        )
     if not told.get("connected"):
         why = told.get("last_failure") or "not connected yet"
         names = ", ".join(told.get("names") or ())
@@ -305,7 +315,7 @@ def gone(state: State) -> Iterator[Finding]:
             f"check that the host of {name} is up and its sidecar runs; plr status shows when and why it left",
         )
     if len(left) > MAX_SHOWN_GONE:
-        yield ok("peer", f"{len(left) - MAX_SHOWN_GONE} more nodes were peers within the last hour")
+        yield ok("peer", f"at least {len(left) - MAX_SHOWN_GONE} more nodes were peers within the last hour")
 
 
 def _path(path: Mapping[str, Any], pinged: Pinged | None, blamed: str | None) -> Finding:
@@ -386,7 +396,7 @@ def services(state: State) -> Iterator[Finding]:
     odd = _by(told.get("conflicts") or (), lambda one: one["service"])
     for name in told.get("unmet") or ():
         if robot and not state["paths"]:
-            yield level("service", f"{name}: configured, but no cloud server is known", "see path above")
+            yield level("service", f"{name}: configured, but no cloud server is {_known(state)}", "see path above")
         elif name not in odd:
             yield level("service", f"{name}: configured, but not offered by {who}", remedy)
     for name, ones in sorted(odd.items()):
@@ -414,6 +424,11 @@ def services(state: State) -> Iterator[Finding]:
         yield level("service", *_none_offered(state))
 
 
+def _known(state: State) -> str:
+    """Return what no peer is, if there is no path: known, or reached."""
+    return "reached" if removed_peers.dormant(state) else "known"
+
+
 def _none_offered(state: State) -> tuple[str, str]:
     """Return why no service is offered here, and what to do."""
     see = "docs/operate/troubleshooting.md, The service does not appear on the robot"
@@ -421,7 +436,7 @@ def _none_offered(state: State) -> tuple[str, str]:
         return "none is offered", see
     told = state.get("services") or {}
     if not state["paths"]:
-        return "none is offered, because no peer is known", "see path above"
+        return f"none is offered, because no peer is {_known(state)}", "see path above"
     if told.get("unmet"):
         return "none is offered: no server offers what is configured", f"see the lines above; {see}"
     if told.get("unreached"):
@@ -542,8 +557,15 @@ def control(state: State) -> Iterator[Finding]:
         yield ok("control", f"{names} reached for {since}, over {over}{last}")
         return
     why = told.get("last_failure") or "not connected yet"
-    known = (state.get("mapping") or {}).get("version") or state["paths"]
-    then = "requests continue with what it sent before" if known else "nothing that it sent before is known"
+    dormant = removed_peers.dormant(state)
+    if state["paths"]:
+        then = "requests continue with what it sent before"
+    elif dormant:
+        then = "the peers that it removed are kept, and requests continue as soon as a path to one answers"
+    elif (state.get("mapping") or {}).get("version"):
+        then = "its last mapping is kept, but no peer is known"
+    else:
+        then = "nothing that it sent before is known"
     yield warn(
         "control",
         f"{names} not reached for {since}: {why}; {then}",

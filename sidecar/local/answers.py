@@ -173,6 +173,15 @@ class _RemovedPeer(_Entry):
     since_s: float
     reason: Text | None = None
     kept: Text | None = None
+    dormant_s: float | None = None
+    heard: bool = False
+
+
+class _RemovedCounts(_Entry):
+    path: Whole = 0
+    dormant: Whole = 0
+    forgotten: Whole = 0
+    at_least: bool = False
 
 
 class _Gone(_Entry):
@@ -232,6 +241,7 @@ _KINDS: dict[str, Any] = {
     "ways": list[_Ways],
     "refused_peers": list[_RefusedPeer],
     "removed_peers": list[_RemovedPeer],
+    "removed_counts": _RemovedCounts,
     "gone": list[_Gone],
     "paths": list[_Path],
     "pinged": list[_PathName],

@@ -21,9 +21,9 @@ from plr.sidecar.local.protocol import VERSION
 from plr.sidecar.local.ways import ways
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Iterator, Mapping
+    from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 
-    from plr.protos.model.ids import InterfaceName
+    from plr.protos.model.ids import InterfaceName, NodeName
     from plr.protos.program.tls_files import TlsWatch
     from plr.protos.trust.clock_floor import ClockFloor
     from plr.sidecar.config.sidecar import SidecarConfig
@@ -39,7 +39,8 @@ PATHS_A_PART = 16
 SERVICES_A_PART = 16
 GONE_S, MAX_GONE = 3600.0, 64
 """Time for which paths to nodes that are no longer peers are reported, and most of them. The same holds for peers that
-the control plane removed, except that those that are still kept are reported for as long."""
+the control plane removed, except that those that are still kept are reported for as long. `removed_counts` counts
+those beyond."""
 MAX_CONFLICTS = 64
 """Most servers of another type shown."""
 MAX_REFUSED_PEERS = 64
@@ -103,7 +104,10 @@ class LocalState:
         yield from self._services(now, destinations)
         refused = self.data_plane.peer_trust.refused(MAX_REFUSED_PEERS)
         yield "refused_peers", [{"name": name, "why": why} for name, why in refused]
-        yield "removed_peers", [_removed(one, now) for one in self.data_plane.removed_peers(now - GONE_S, MAX_GONE)]
+        heard = self.data_plane.heard_dormant(now)
+        removed = self.data_plane.removed_peers(now - GONE_S, MAX_GONE)
+        yield "removed_peers", [_removed(one, now, heard) for one in removed]
+        yield "removed_counts", self.data_plane.removed_counts(now - GONE_S)._asdict()
         gone = self.data_plane.gone_paths(now - GONE_S, MAX_GONE)
         yield (
             "gone",
@@ -267,13 +271,15 @@ class LocalState:
             )
 
 
-def _removed(peer: RemovedPeerView, now: float) -> dict[str, Any]:
-    reason = peer.removal.reason
+def _removed(peer: RemovedPeerView, now: float, heard: Collection[NodeName] = ()) -> dict[str, Any]:
+    reason, dormant_at = peer.removal.reason, peer.removal.dormant_at
     return {
         "name": peer.name,
         "reason": None if reason is None else reason.value,
         "since_s": max(0.0, now - peer.removal.at),
         "kept": peer.kept,
+        "dormant_s": max(0.0, now - dormant_at) if peer.kept == "dormant" and dormant_at is not None else None,
+        "heard": peer.kept == "dormant" and peer.name in heard,
     }
 
 

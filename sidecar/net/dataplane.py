@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from plr.sidecar.core.base.report_scope import ReportScope
     from plr.sidecar.core.base.values import ExecutionId, PathId, RejectReason, RequestId
     from plr.sidecar.core.crypto.session import OwnSession
-    from plr.sidecar.core.engine.engine import RemovedPeerView
+    from plr.sidecar.core.engine.engine import RemovedCounts, RemovedPeerView
     from plr.sidecar.core.message.decoding import Decoding
     from plr.sidecar.core.path.history import LivenessChange
     from plr.sidecar.core.path.view import PathView
@@ -273,6 +273,15 @@ class ThreadedDataPlane:
         """Return the peers that the control plane removed after `since` (monotonic, s), and those that are kept."""
         with self._lock:
             return self._engine.removed_peers(since, at_most)
+
+    def removed_counts(self, since: float) -> RemovedCounts:
+        """Return how many peers the control plane removed after `since` (monotonic, s), and how many are kept."""
+        with self._lock:
+            return self._engine.removed_counts(since)
+
+    def heard_dormant(self, now: float) -> set[NodeName]:
+        """Return the dormant peers that are heard, but do not hear what this sidecar answers; takes no lock."""
+        return {name for link in list(self._links.values()) for name in link.link.heard_dormant(now)}
 
     def destinations(self) -> Destinations:
         """Robot: return where new requests may go; the engine's lock is held to copy references only."""

@@ -86,7 +86,7 @@ def test_who_is_gone_is_shown_and_explained(alone: ControlPlaneProcess, capsys: 
     assert operator.gone()["cloud-a"] == "DEPARTURE_REASON_DRAINED"
     text = operator.ask("status")
     assert "gone sidecars, newest first:" in text
-    assert "lease_expired: silent for longer than its lease" in text
+    assert "lease_expired: not heard by the control plane for longer than its lease" in text
     assert kinds(operator.events("--node", "robot")) == ["connected", "stream_lost", "departed"]
     assert operator.events("--last", "1") == operator.events()[-1:]
     assert main(["events", "--insecure", "--address", alone.address, "--node", "rbot"]) == 0

@@ -17,7 +17,7 @@ from plr.sidecar.core.base.slices import SLICE, Backlog
 from plr.sidecar.core.base.values import PathId, PathState
 from plr.sidecar.core.cloud.cloud_role import CloudRole
 from plr.sidecar.core.engine.peers import Peers
-from plr.sidecar.core.engine.removals import WHY_REMOVED, Removals
+from plr.sidecar.core.engine.removals import MAX_REMOVALS, WHY_REMOVED, Removals
 from plr.sidecar.core.engine.revocation_exchange import RevocationExchange
 from plr.sidecar.core.robot.robot_role import RobotRole
 from plr.sidecar.core.rules.service_rule import Rules, ServiceRule
@@ -82,6 +82,18 @@ class RemovedPeerView(NamedTuple):
     removal: Removal
     kept: str | None
     """`path`: it is a peer still, as a path to it lives; `dormant`; None: it is forgotten."""
+
+
+class RemovedCounts(NamedTuple):
+    """How many peers the control plane removed."""
+
+    path: int
+    """Those that are peers still, as a path to them lives."""
+    dormant: int
+    forgotten: int
+    """Those removed within the time asked for and not kept, as far as they are remembered."""
+    at_least: bool
+    """Whether more of those may have been forgotten than are counted: `MAX_REMOVALS` are remembered."""
 
 
 class WrongRoleError(RuntimeError):
@@ -205,7 +217,8 @@ class Engine:
     def apply_peers(self, peer_set: PeerSet, now: float) -> str | None:
         """Take a view of the peers; return why it is refused, or None."""
         before = {peer.name: peer.session for peer in self.peers.all()}
-        held = [peer.name for peer in (*self.peers.all_held(), *self.peers.all_refused())]
+        held = [name for name in before if not self.peers.is_unlisted(name)]
+        held += [peer.name for peer in self.peers.all_refused()]
         left = {removed.name for removed in peer_set.removed if removed.reason is not RemovalReason.LEASE_EXPIRED}
         error = self.peers.apply(peer_set, self.routes.reaches)
         if error:
@@ -213,6 +226,7 @@ class Engine:
             return error
         self.stats.peers_version = self.peers.version
         self.removals.follow(peer_set, held, now)
+        self.removals.note_dormant(filter(self.peers.is_dormant, before), now)
         self._tell_links_of_peers(peer_set.removed)
         self._role.on_peers_changed(now)
         ended = [name for name, session in before.items() if self.peers.session(name) != session]
@@ -231,6 +245,18 @@ class Engine:
             if kept or removal.at > since:
                 found.append(RemovedPeerView(name, removal, kept))
         return found[:at_most]
+
+    def removed_counts(self, since: float) -> RemovedCounts:
+        """Return how many peers the control plane removed after `since` (s); kept ones always."""
+        names = self.peers.names()
+        path = sum(map(self.peers.is_unlisted, names))
+        dormant = len(self.peers.all_held()) - len(names)
+        latest = self.removals.latest()
+        forgotten = sum(
+            removal.at > since and name not in self.peers and not self.peers.is_dormant(name)
+            for name, removal in latest
+        )
+        return RemovedCounts(path, dormant, forgotten, at_least=len(latest) >= MAX_REMOVALS)
 
     def services_of_peers(self) -> set[ServiceName]:
         """Return the services that the peers offer, whatever their names."""
@@ -386,6 +412,7 @@ class Engine:
                 dormant[name] = session
         if not dormant:
             return
+        self.removals.note_dormant(dormant, now)
         self._role.on_peers_changed(now)
         for name, session in dormant.items():
             self._forget_session(name, now, may_return=session)

@@ -9,7 +9,7 @@ from plr.protos.model.members import RemovalReason
 
 if TYPE_CHECKING:
     from collections import Counter
-    from collections.abc import Collection
+    from collections.abc import Collection, Iterable
 
     from plr.protos.model.ids import NodeName
     from plr.protos.model.members import PeerSet
@@ -33,6 +33,8 @@ class Removal(NamedTuple):
     """None: the view just does not list it any more."""
     at: float
     """When it was removed (monotonic, s)."""
+    dormant_at: float | None = None
+    """When it last became dormant (monotonic, s); None: not since it was removed."""
 
 
 class Removals:
@@ -43,7 +45,10 @@ class Removals:
         self._removals: OrderedDict[NodeName, Removal] = OrderedDict()
 
     def follow(self, peer_set: PeerSet, held: Collection[NodeName], now: float) -> None:
-        """Follow a view that is in force; `held` are the peers, refused ones included, that were known before it."""
+        """Follow a view that is in force; `held` are the peers, refused ones included, that the view before it listed.
+
+        Others were removed before: a removal that is forgotten would begin again with the time of this view.
+        """
         for peer in peer_set.peers:
             self._removals.pop(peer.name, None)
         listed = {peer.name for peer in peer_set.peers}
@@ -54,11 +59,18 @@ class Removals:
         for name, reason in reasons.items():
             known = self._removals.get(name)
             if known is not None and known.reason is not reason:
-                self._removals[name] = Removal(reason, now)
+                self._removals[name] = known._replace(reason=reason, at=now)
                 self._removals.move_to_end(name)
         while len(self._removals) > MAX_REMOVALS:
             self._removals.popitem(last=False)
             self._dropped["removal_forgotten"] += 1
+
+    def note_dormant(self, names: Iterable[NodeName], now: float) -> None:
+        """Note that these removed peers became dormant."""
+        for name in names:
+            removal = self._removals.get(name)
+            if removal is not None:
+                self._removals[name] = removal._replace(dormant_at=now)
 
     def latest(self) -> list[tuple[NodeName, Removal]]:
         """Return the removals, the last one first."""

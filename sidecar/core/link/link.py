@@ -220,23 +220,31 @@ class Link:
         return self._table.pings.done
 
     def path_ids(self) -> set[PathId]:
-        """Return the ids of all paths, except those to dormant peers; any thread may ask."""
-        return {path.id for path in list(self._paths.values()) if not path.probing.dormant}
+        """Return the ids of all paths, except those to dormant peers that are down; any thread may ask."""
+        return {path.id for path in list(self._paths.values()) if not path.is_dormant}
 
     def paths_to(self, peer: str) -> list[PathId]:
         """Return the paths to a peer; any thread may ask."""
         return [path.id for (name, _), path in self._paths.copy().items() if name == peer]
 
     def views(self, now: float) -> Iterator[PathView]:
-        """Yield the current view of each path, except those to dormant peers.
+        """Yield the current view of each path, except those to dormant peers that are down.
 
         Any thread may ask: it reads what this link's thread writes.
 
         Each view costs that thread nothing but its turn of the interpreter; a caller with many may pause between them.
         """
         for path in list(self._paths.values()):
-            if not path.probing.dormant:
+            if not path.is_dormant:
                 yield view_of(path, now)
+
+    def heard_dormant(self, now: float) -> set[NodeName]:
+        """Return the dormant peers that introduce themselves again and again; any thread may ask.
+
+        Each introduction is answered, so they do not hear the answers.
+        """
+        paths = list(self._paths.values())
+        return {path.peer for path in paths if path.is_dormant and path.introductions.introducer(now)}
 
     def living(self) -> list[PathId]:
         """Return the paths that are not down."""
@@ -318,7 +326,7 @@ class Link:
             self._publish_stats_of(peer)
 
     def _publish_stats_of(self, peer: NodeName) -> None:
-        paths = [path for path in self._table.to(peer) if not path.probing.dormant]
+        paths = [path for path in self._table.to(peer) if not path.is_dormant]
         if not paths:
             self.stats.paths.pop(peer, None)
             return

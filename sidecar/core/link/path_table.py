@@ -112,6 +112,7 @@ class PathTable:
             self._drop(unproven)
         path = self._new_path(peer, remote, (), self.next_number, now)
         if path is not None:
+            path.set_dormant(now, dormant=peer.dormant)
             self._enter(path)
         return path
 
@@ -225,6 +226,7 @@ class PathTable:
             known = self.by_session.get(path.session)
             if path.state is not PathState.DOWN and known is not None and key not in self.paths:
                 # It proves itself, whether the control plane's view is older or newer than what happened here.
+                path.set_dormant(now, dormant=known.dormant)
                 self._enter(before.pop(key))
         for path in before.values():
             self._forget(path)

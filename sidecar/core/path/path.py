@@ -162,6 +162,11 @@ class Path:
             self.probing.begin_again(now)
         self.probing.dormant = dormant
 
+    @property
+    def is_dormant(self) -> bool:
+        """Whether the peer is dormant. Once the path is up, it is not, although the link is told so a little later."""
+        return self.probing.dormant and self.state is PathState.DOWN
+
     def note_source(self, source: str | None) -> None:
         """Note the local address from which the kernel sends there; None while it is unknown."""
         self.source = source

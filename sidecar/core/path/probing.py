@@ -171,7 +171,7 @@ class Probing:
         self.at = now + self._gap * self._rng.uniform(1 - DOWN_SPREAD, 1 + DOWN_SPREAD)
         backoff = RETURN_BACKOFF if self._was_up else PROBE_BACKOFF
         longest = MAX_PROBE_S if self._leads else MAX_WATCH_PROBE_S
-        if self.dormant:
+        if self.dormant and self._leads:
             longest = MAX_DORMANT_PROBE_S
         self._gap = min(self._gap * backoff, self._patience * longest)
 

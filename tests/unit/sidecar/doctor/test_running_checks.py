@@ -139,6 +139,30 @@ def test_a_robot_without_a_peer_fails_and_says_why(changes: dict[str, Any], why:
         assert texts(running_checks.paths(state(paths=[], node=other, **changes), {}), Level.FAIL) == []
 
 
+DORMANT = {"name": "cloud-c", "reason": "lease_expired", "since_s": 7200.0, "kept": "dormant", "dormant_s": 60.0}
+OUT_OF_REACH = {"names": ["cp:50051"], "connected": False, "since_s": 7000.0, "last_failure": "timed out"}
+
+
+@pytest.mark.parametrize("control", [OUT_OF_REACH, {"names": ["cp:50051"], "connected": True}])
+def test_a_robot_whose_only_server_is_dormant_is_told_that_it_is_kept(control: dict[str, Any]) -> None:
+    told = state(paths=[], control=control, removed_peers=[DORMANT], mapping={"version": 0}, services=UNMET)
+    (finding,) = running_checks.paths(told, {})
+    assert finding.level is Level.FAIL
+    assert finding.text == (
+        "no peer is reached; the control plane removed these, and this sidecar keeps them: cloud-c (removed 2 h ago: "
+        "its lease expired, no path to it has been up for 60 s). It talks to each as soon as a path answers"
+    )
+    assert "Do not restart this sidecar" in finding.remedy
+    assert ("see control below" in finding.remedy) is not control["connected"]
+    services = texts(running_checks.services(told), Level.FAIL)
+    assert services == [
+        *(f"{name}: configured, but no cloud server is reached" for name in UNMET["unmet"]),
+        "none is offered, because no peer is reached",
+    ]
+    young = {**told, "node": {**told["node"], "up_s": 2.0}}
+    assert texts(running_checks.paths(young, {}), Level.FAIL) == []
+
+
 def test_pings_are_shown_and_missed_ones_warned_of() -> None:
     key = ("wlan0", "cloud-a", 0)
     one = state(paths=[path("wlan0", "cloud-a")])
@@ -387,6 +411,10 @@ def test_the_control_stream() -> None:
     assert text.startswith("cp:50051 not reached for 90 s: nothing arrives over wlan0; requests continue")
     nothing = state(control=lost, mapping={"version": 0}, paths=[])
     assert "nothing that it sent before is known" in texts(running_checks.control(nothing), Level.WARN)[0]
+    dormant = state(control=lost, mapping={"version": 7}, paths=[], removed_peers=[DORMANT])
+    assert "; the peers that it removed are kept, and" in texts(running_checks.control(dormant), Level.WARN)[0]
+    mapped = state(control=lost, mapping={"version": 7}, paths=[])
+    assert "; its last mapping is kept, but no peer is known" in texts(running_checks.control(mapped), Level.WARN)[0]
 
 
 def test_a_socket_that_could_not_be_opened_fails() -> None:

@@ -66,7 +66,7 @@ def line(**said: Any) -> bytes:
 def parts(value: Any) -> Callable[[int], Iterator[bytes]]:
     names = (
         "node paths services certificate clock mapping mapped control interfaces idle gone refused_peers removed_peers "
-        "pinged pong"
+        "removed_counts pinged pong"
     )
 
     def say(number: int) -> Iterator[bytes]:

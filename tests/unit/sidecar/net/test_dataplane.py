@@ -79,6 +79,8 @@ def test_a_peer_that_is_gone_is_reported(nodes: tuple[Node, Node]) -> None:
     assert last.reason == "peer closed"
     assert robot.plane.gone_paths(time.monotonic(), 8) == []
     assert [(one.name, one.kept) for one in robot.plane.removed_peers(0.0, 8)] == [(cloud.name, "dormant")]
+    assert robot.plane.removed_counts(0.0)[:3] == (0, 1, 0)
+    assert robot.plane.heard_dormant(time.monotonic()) == set()
 
 
 def test_garbage_into_the_socket_is_counted_and_the_rest_is_served(nodes: tuple[Node, Node]) -> None:

@@ -125,7 +125,8 @@ def test_the_last_mapping_of_a_robot_that_is_gone_is_explained(world: World) -> 
     assert all(10.0 < pair.probes < 20.0 for pair in found.pairs)
     assert [pair.rtt.quantile(0.5) for pair in found.pairs] == pytest.approx([0.02] * 4, rel=0.03)
     assert found.alternatives
-    assert f"{ROBOT} IS GONE" in render(found)
+    assert f"{ROBOT} IS GONE for the control plane for 10 min (lease_expired)" in render(found)
+    assert f"{ROBOT} IS GONE for 10 min (revoked)" in render(replace(found, gone_why=Why.REVOKED))
 
 
 def test_a_service_that_a_robot_never_carried_is_not_explained(world: World) -> None:

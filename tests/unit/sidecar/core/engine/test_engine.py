@@ -11,7 +11,8 @@ from plr.protos.model.members import Peer, PeerSet, RemovalReason, RemovedPeer, 
 from plr.protos.model.redundancy_mode import RedundancyMode
 from plr.sidecar.core.base.report_scope import ReportScope
 from plr.sidecar.core.base.values import PathId, PathState, Priority, RejectReason
-from plr.sidecar.core.engine.engine import SWEEP_EVERY_S, Engine, EngineConfig
+from plr.sidecar.core.engine.engine import SWEEP_EVERY_S, Engine, EngineConfig, RemovedCounts
+from plr.sidecar.core.engine.removals import MAX_REMOVALS
 from plr.sidecar.core.message.reassembly import OVER_REMEMBERED
 from plr.sidecar.core.robot.request.service_catalog import WITHDRAW_AFTER_S
 from plr.sidecar.core.rules.budget import Budget
@@ -403,8 +404,26 @@ def test_a_removed_peer_is_told_with_the_reason_and_what_is_kept_of_it() -> None
     assert told(10.0) == [(3.0, "path")]
     sidecar.change(PathState.DOWN, 4.0)
     assert told(10.0) == told(9000.0) == [(3.0, "dormant")]
+    assert sidecar.engine.removed_peers(9000.0, 9)[0].removal.dormant_at == 4.0
     assert sidecar.engine.apply_peers(PeerSet(Version(3), 1, (peer(A),)), 5.0) is None
     assert told(10.0) == []
+
+
+def test_all_removed_peers_are_counted_whether_or_not_their_reasons_are_remembered() -> None:
+    many = [peer(NodeName(f"n{number}"), session=number + 10) for number in range(MAX_REMOVALS + 100)]
+    sidecar = cloud()
+    sidecar.view(peer(ROBOT), *many, version=2)
+    expired = (RemovedPeer(ROBOT, RemovalReason.LEASE_EXPIRED),)
+    assert sidecar.engine.apply_peers(PeerSet(Version(3), 1, (), expired), 3.0) is None
+    assert sidecar.engine.removed_counts(0.0) == RemovedCounts(1, len(many), 0, at_least=True)
+    before = sidecar.engine.removals.latest()
+    assert sidecar.engine.apply_peers(PeerSet(Version(4), 1, ()), 9.0) is None
+    assert sidecar.engine.removals.latest() == before, "a forgotten removal does not begin again"
+    assert {one.removal.dormant_at for one in sidecar.engine.removed_peers(0.0, 9)} == {3.0}
+    left = tuple(RemovedPeer(NodeName(f"n{number}"), RemovalReason.LEFT) for number in range(1000, 1010))
+    assert sidecar.engine.apply_peers(PeerSet(Version(5), 1, (), left), 12.0) is None
+    assert sidecar.engine.removed_counts(10.0)[:3] == (1, len(many) - 10, 10)
+    assert sidecar.engine.removed_counts(12.0)[:3] == (1, len(many) - 10, 0)
 
 
 def test_paths_of_a_peer_that_goes_at_once_end_with_the_reason() -> None:

@@ -49,3 +49,14 @@ def test_the_one_removed_first_is_forgotten() -> None:
 
 def test_each_reason_has_words() -> None:
     assert WHY_REMOVED.keys() == set(RemovalReason)
+
+
+def test_a_removal_keeps_the_time_since_when_the_peer_is_dormant() -> None:
+    removals = Removals(Counter())
+    removals.follow(view(), [A], 5.0)
+    removals.note_dormant([A, B], 6.0)
+    assert removals.latest() == [(A, Removal(None, 5.0, 6.0))]
+    removals.follow(view(cloud_a=EXPIRED), [], 7.0)
+    assert removals.latest() == [(A, Removal(EXPIRED, 7.0, 6.0))]
+    removals.note_dormant([A], 8.0)
+    assert removals.latest() == [(A, Removal(EXPIRED, 7.0, 8.0))]

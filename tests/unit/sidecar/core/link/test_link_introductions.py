@@ -11,7 +11,7 @@ from plr.protos.model.ids import InterfaceId, NodeName
 from plr.sidecar.core.base.values import PathId, PathState
 from plr.sidecar.core.link.path_table import MAX_PATHS_OF_A_PEER, NEW_PATHS, NEW_PATHS_PER_S
 from plr.sidecar.core.path.probing import FIRST_PROBE_S
-from plr.sidecar.core.seam.links import PathChanged, SetCredential
+from plr.sidecar.core.seam.links import PathChanged, SetCredential, SetPeers
 from plr.sidecar.core.wire import frame
 from plr.sidecar.core.wire.frame import Probe, ProbeReply
 from plr.sidecar.core.wire.introduction import Introduction
@@ -48,6 +48,33 @@ def test_a_peers_new_interface_is_known_by_its_introduction_before_any_view_name
     bench.know()  # a view that still does not name it
     assert state_changes(bench) == []
     assert bench.link.in_use(PEER_ADDRESS)
+
+
+def test_a_dormant_peer_that_introduces_itself_has_no_path_for_people_until_it_hears_the_answer() -> None:
+    bench = Bench()
+    nowhere = bench.link_peer(addresses=())
+    bench.execute(SetPeers((replace(nowhere, dormant=True),)))
+    introduce(bench, 0)
+    assert not bench.link.heard_dormant(bench.now), "it may hear this answer"
+    bench.sent()
+    bench.wait(FIRST_PROBE_S)
+    introduce(bench, 1)
+    assert bench.link.heard_dormant(bench.now) == {A}
+    assert not list(bench.link.views(bench.now))
+    assert not bench.link.path_ids()
+    assert not bench.link.stats.paths
+    probe = next(item for item in bench.frames(bench.sent()) if isinstance(item, Probe))
+    bench.now += 0.01
+    bench.receive_datagram(
+        bench.datagram(frame.encode_probe_reply(ProbeReply(probe.id)), number=2, interface=NEW_INTERFACE)
+    )
+    assert PathChanged(NEW_PATH, PathState.UP, "answers") in bench.events()
+    assert bench.link.path_ids() == {NEW_PATH}, "the link is told a little later that it is a peer again"
+    assert not bench.link.heard_dormant(bench.now)
+    bench.execute(SetPeers((nowhere,)))
+    bench.wait(60.0)
+    (view,) = bench.link.views(bench.now)
+    assert view.state is PathState.DOWN, "a path of a peer is shown when it is down"
 
 
 def test_an_introduction_is_answered_where_it_came_from_in_fewer_bytes_and_moves_nothing() -> None:

@@ -151,6 +151,16 @@ def test_a_dormant_peer_is_asked_a_fiftieth_of_its_downtime_apart_and_ever_less_
     assert sum(at > 6 * 86_400.0 for at in after) < 1.2 * 86_400.0 / MAX_DORMANT_PROBE_S
 
 
+def test_who_does_not_lead_looks_for_a_dormant_peer_as_for_any_other() -> None:
+    subject = Probing(100.0, RNG, leads=False)
+    subject.dormant = True
+    for _ in range(400):
+        subject.plan_down(subject.at)
+    before = subject.at
+    subject.plan_down(before)
+    assert subject.at - before == pytest.approx(MAX_WATCH_PROBE_S, rel=0.11)
+
+
 def _gaps(times: list[float]) -> list[float]:
     return [later - at for at, later in itertools.pairwise(times)]
 
