@@ -13,7 +13,7 @@ import pytest
 from lab.simulated.mesh import Mesh, rule
 from lab.simulated.sessions import credential_of, seal, session_of
 from plr.protos.model.ids import InterfaceId, InterfaceName, NodeName, Role, SessionId, Version
-from plr.protos.model.members import PeerSet
+from plr.protos.model.members import PeerSet, RemovalReason, RemovedPeer
 from plr.sidecar.core.link.memory import MAX_REMEMBERED_PATHS_OF_PEER
 from plr.sidecar.core.path.key_exchange import DEFAULT_LIMITS, KeyLimits
 from plr.sidecar.core.path.keys import make_path_keys
@@ -72,13 +72,14 @@ class Flood:
             self._mesh.run(1.05)
 
 
-def show_all_but(mesh: Mesh, *away: NodeName) -> None:
-    """The control plane's view without these."""
+def show_all_but(mesh: Mesh, *away: NodeName, left: bool = False) -> None:
+    """The control plane's view without these; `left`: they said that they leave, so nobody keeps them."""
     mesh.version += 1
     for node in mesh.nodes.values():
         others = (other for other in mesh.nodes.values() if other.role is not node.role and other.name not in away)
         peers = tuple(other.told_to(node) for other in others)
-        assert node.engine.apply_peers(PeerSet(Version(mesh.version), mesh.version, peers), mesh.now) is None
+        removed = tuple(RemovedPeer(name, RemovalReason.LEFT) for name in away) if left else ()
+        assert node.engine.apply_peers(PeerSet(Version(mesh.version), mesh.version, peers, removed), mesh.now) is None
         mesh.pump(node)
 
 
@@ -155,6 +156,29 @@ def test_a_robot_whose_keys_have_changed_comes_back_after_the_flood(*, proven: b
     assert cloud.executed
 
 
+def test_a_member_that_is_kept_though_not_listed_does_not_go_back_to_an_old_session() -> None:
+    mesh = Mesh(1)
+    mesh.robot("wlan0")
+    evil, cloud = mesh.add("evil", Role.ROBOT, ["wlan0"], (rule(),)), mesh.cloud("cloud-a")
+    mesh.push_views()
+    mesh.run(5)
+    old = evil.told_to(cloud)
+    cut(mesh, "evil.wlan0", off=True)
+    flood = Flood(mesh, evil, cloud, proven=True)
+    newest = SessionId(evil.session + 1)
+    for _ in range(2):
+        flood.begin_session(evil.incarnation + 1, newest)
+    mesh.run(30)
+    show_all_but(mesh, evil.name)
+    mesh.run(1)
+    assert not of_cloud(cloud)._table.to(evil.name)
+    mesh.version += 1
+    views = (mesh.nodes["robot"].told_to(cloud), old)
+    assert cloud.engine.apply_peers(PeerSet(Version(mesh.version), mesh.version, views), mesh.now) is None
+    mesh.pump(cloud)
+    assert {path.session for path in of_cloud(cloud)._table.to(evil.name)} == {newest}
+
+
 def test_a_forgotten_session_is_refused_and_a_newer_one_is_not() -> None:
     """Whoever fills its own share loses its own old sessions: one of them that comes back does not start over."""
     mesh = Mesh(1)
@@ -166,7 +190,7 @@ def test_a_forgotten_session_is_refused_and_a_newer_one_is_not() -> None:
     cut(mesh, "evil.wlan0", off=True)
     Flood(mesh, evil, cloud, proven=True).run()
     mesh.run(30)
-    show_all_but(mesh, evil.name)
+    show_all_but(mesh, evil.name, left=True)
     mesh.run(1)
     link = of_cloud(cloud)
     mesh.version += 1
