@@ -41,6 +41,8 @@ class DormantPeers:
         self._most = MAX_DORMANT_SERVERS if role is Role.ROBOT else MAX_PEERS
         self._dropped = dropped
         self._peers: OrderedDict[NodeName, Dormant] = OrderedDict()
+        self._forgotten: dict[NodeName, SessionId] = {}
+        """Those forgotten since `take_forgotten`, which the engine calls after each change."""
 
     def __contains__(self, name: object) -> bool:
         return name in self._peers
@@ -70,9 +72,16 @@ class DormantPeers:
         for name, dormant in list(self._peers.items()):
             if over(dormant.peer):
                 del self._peers[name]
+                self._forgotten[name] = dormant.peer.session
 
     def make_room(self, awake: int) -> None:
         """Forget those dormant for longest until the rest fit beside `awake` other peers."""
         while len(self._peers) > max(0, min(self._most, MAX_PEERS - awake)):
-            self._peers.popitem(last=False)
+            name, dormant = self._peers.popitem(last=False)
+            self._forgotten[name] = dormant.peer.session
             self._dropped["dormant_full"] += 1
+
+    def take_forgotten(self) -> dict[NodeName, SessionId]:
+        """Return those forgotten since the last call, and their sessions."""
+        forgotten, self._forgotten = self._forgotten, {}
+        return forgotten

@@ -338,14 +338,26 @@ class Peers:
         return True
 
     def may_call(self, name: NodeName, service: ServiceName) -> bool:
-        """Cloud: return whether the control plane lets this robot call the service here; False if it is unknown."""
-        peer = self._known.get(name)
+        """Cloud: return whether the control plane lets this robot call the service here; False if it is unknown.
+
+        A dormant robot may still call what it was last let call: its request may come before its path is up.
+        """
+        peer = self._known.get(name) or self._held(name)
         return peer is not None and service in peer.may_call
 
     def session(self, name: NodeName) -> SessionId | None:
         """Return a peer's session."""
         peer = self._known.get(name)
         return None if peer is None else peer.session
+
+    def held_session(self, name: NodeName) -> SessionId | None:
+        """Return the session of a peer, dormant or not."""
+        peer = self._held(name)
+        return None if peer is None else peer.session
+
+    def take_forgotten(self) -> dict[NodeName, SessionId]:
+        """Return the dormant peers forgotten since the last call, and their sessions."""
+        return self._dormant.take_forgotten()
 
     def for_links(self) -> tuple[LinkPeer, ...]:
         """Return the peers as links need them, the dormant ones included: links answer them."""
