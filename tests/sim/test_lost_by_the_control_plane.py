@@ -115,6 +115,26 @@ def test_a_tunnel_ends_no_request_that_may_run_once_only(who: str) -> None:
     assert len(trial.cloud.executed) == trial.robot.sequence, "each ran once"
 
 
+def test_a_robot_comes_back_while_the_views_of_its_server_keep_changing() -> None:
+    """Each of them comes before the answer to the answer to its introduction."""
+    trial = Trial()
+    trial.lose(trial.robot)
+    for wire in trial.wires:
+        wire.delay_s = 0.15
+    seen = trial.planes.peer_sets[trial.cloud.name]
+
+    def view_again() -> None:
+        assert trial.cloud.engine.apply_peers(seen, trial.mesh.now) is None
+        trial.mesh.pump(trial.cloud)
+        trial.mesh.at(0.1, view_again)
+
+    view_again()
+    trial.dark(10.0)
+    assert trial.cloud.engine.peers.is_dormant(trial.robot.name)
+    trial.planes.run(SOON_S)
+    assert trial.is_answered()
+
+
 @pytest.mark.parametrize("seed", range(5))
 def test_what_arrives_before_the_answer_that_brings_its_path_up_is_not_lost(seed: int) -> None:
     trial = Trial(seed)
