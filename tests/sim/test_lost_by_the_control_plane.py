@@ -5,20 +5,24 @@ The control plane reaches all others, and tells them that the lease expired.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import pytest
 
 from lab.simulated.mesh import SERVICE, Mesh, Node, rule
+from lab.simulated.sessions import with_credential
 from plr.controlplane.core.policy.policy import CallRule, OfferRule, Policy
-from plr.protos.model.ids import NodeName
+from plr.protos.model.ids import NodeName, Role
 from plr.protos.model.members import RemovalReason
+from plr.protos.trust.identity import EXPIRED, CertificateError
 from plr.sidecar.core.seam.links import SetReady
 from tests.sim.joined_planes import JoinedPlanes
 from tests.sim.nat import NatMesh
 
 if TYPE_CHECKING:
     from lab.simulated.mesh import Wire
+    from plr.protos.trust.credential import SessionCredential
     from plr.sidecar.core.base.values import RequestId
 
 EVERYBODY = (OfferRule(("*",), ("*",)),)
@@ -113,6 +117,44 @@ def test_a_tunnel_ends_no_request_that_may_run_once_only(who: str) -> None:
     trial.planes.run(SOON_S)
     assert set(asked) <= {answer.request_id for answer in trial.robot.responses()}
     assert len(trial.cloud.executed) == trial.robot.sequence, "each ran once"
+
+
+@pytest.mark.parametrize("dark_s", [0.0, 60.0])
+@pytest.mark.parametrize("who", ["robot", "cloud"])
+def test_a_clock_that_is_wrong_for_two_seconds_does_not_part_it_from_its_peers(who: str, dark_s: float) -> None:
+    trial = Trial()
+    lost = getattr(trial, who)
+    trial.lose(lost)
+    trial.dark(dark_s)
+    other = trial.other_end(lost)
+    right = other.own._verify
+
+    def wrong(_: SessionCredential) -> float:
+        raise CertificateError(EXPIRED, "expired 99 s ago")
+
+    for verify in (wrong, right):
+        other.own._verify = verify
+        other.own.forget_admitted()
+        other.engine.recheck_peers(other.engine.peers.all_refused(), trial.mesh.now)
+        trial.mesh.pump(other)
+        assert (lost.name in [peer.name for peer in other.engine.peers.all_held()]) is (verify is right)
+        trial.planes.run(2.0)
+    assert trial.is_answered()
+
+
+def test_a_member_cannot_take_the_place_of_a_lost_one() -> None:
+    """It asks the control plane of the cloud for the session number that it saw, and has a certificate of its own."""
+    trial = Trial()
+    thief = trial.mesh.add("thief", Role.ROBOT, ["wlan0"], (rule(),))
+    trial.lose(trial.robot)
+    trial.dark(20.0)
+    stolen = with_credential(replace(thief.told_to(trial.cloud), session=trial.robot.session))
+    view = trial.planes.peer_sets[trial.cloud.name]
+    assert trial.cloud.engine.apply_peers(replace(view, peers=(*view.peers, stolen)), trial.mesh.now) is None
+    trial.mesh.pump(trial.cloud)
+    trial.planes.run(SOON_S)
+    assert trial.is_answered()
+    assert list(trial.cloud.engine.peers.refused) == [thief.name]
 
 
 def test_a_robot_comes_back_while_the_views_of_its_server_keep_changing() -> None:
