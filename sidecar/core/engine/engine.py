@@ -212,7 +212,8 @@ class Engine:
             self.stats.nacks += 1
             return error
         self.stats.peers_version = self.peers.version
-        self.removals.follow(peer_set, held, now)
+        kept, ended_by_policy = self.peers.all_kept(), self.peers.ended_by_policy
+        self.removals.follow(peer_set, held, now, kept=kept, ended_by_policy=ended_by_policy)
         self._tell_links_of_peers(peer_set.removed)
         self._role.on_peers_changed(now)
         for name, session in before.items():

@@ -80,6 +80,8 @@ class Peers:
         self._budget = VerificationBudget()
         self._policy = NO_POLICY
         """Fingerprint of the last access policy applied."""
+        self.ended_by_policy: frozenset[NodeName] = frozenset()
+        """The peers that the last view did not list, and that were forgotten because it has another policy."""
         self.version = Version(0)
 
     def __contains__(self, name: object) -> bool:
@@ -100,6 +102,11 @@ class Peers:
     def all_held(self) -> list[Peer]:
         """Return all known peers and the dormant ones, which are judged with them."""
         return [*self._known.values(), *(dormant.peer for dormant in self._dormant.all())]
+
+    def all_kept(self) -> set[NodeName]:
+        """Return the names of those that are kept although the view does not list them, in whatever state."""
+        kept = (*(dormant.peer for dormant in self._dormant.all()), *self._dormant.aside())
+        return self._unlisted.union(peer.name for peer in kept)
 
     def is_unlisted(self, name: NodeName) -> bool:
         """Return whether this is a peer for its living paths only, as the view does not list it."""
@@ -147,6 +154,8 @@ class Peers:
         def may_not_return(peer: Peer) -> bool:
             return new_policy or peer.name in over
 
+        others = self._sessions_besides(over).values() if new_policy else ()
+        self.ended_by_policy = frozenset(others)
         self._dormant.drop(may_not_return)
         for name, peer in self._known.items():
             if may_not_return(peer):

@@ -9,7 +9,7 @@ from plr.protos.model.members import RemovalReason
 
 if TYPE_CHECKING:
     from collections import Counter
-    from collections.abc import Collection
+    from collections.abc import Container, Iterable
 
     from plr.protos.model.ids import NodeName
     from plr.protos.model.members import PeerSet
@@ -23,7 +23,8 @@ WHY_REMOVED = {
 }
 """Each reason for people."""
 MAX_REMOVALS = 1024
-"""Removed peers that are remembered, one entry for each name; the one removed first is forgotten."""
+"""Removed peers that are remembered, one entry for each name; the one removed first is forgotten. Those that are kept
+all the same (`peers.py`) are always remembered: people ask about them, and they are at most `MAX_PEERS`."""
 
 
 class Removal(NamedTuple):
@@ -42,22 +43,44 @@ class Removals:
         self._dropped = dropped
         self._removals: OrderedDict[NodeName, Removal] = OrderedDict()
 
-    def follow(self, peer_set: PeerSet, held: Collection[NodeName], now: float) -> None:
-        """Follow a view that is in force; `held` are the peers, refused ones included, that were known before it."""
+    def follow(
+        self,
+        peer_set: PeerSet,
+        held: Iterable[NodeName],
+        now: float,
+        *,
+        kept: Container[NodeName] = (),
+        ended_by_policy: Container[NodeName] = (),
+    ) -> None:
+        """Follow a view that is in force; `held` are the peers, refused ones included, that were known before it.
+
+        `kept` are those peers that are kept though it does not list them, `ended_by_policy` those that were kept, and
+        are not, since the access policy is another one now.
+        """
         for peer in peer_set.peers:
             self._removals.pop(peer.name, None)
         listed = {peer.name for peer in peer_set.peers}
         reasons = {removed.name: removed.reason for removed in peer_set.removed}
         for name in held:
+            if name in ended_by_policy:
+                reasons[name] = RemovalReason.FORBIDDEN
             if name not in listed and name not in self._removals:
                 self._removals[name] = Removal(reasons.get(name), now)
         for name, reason in reasons.items():
             known = self._removals.get(name)
-            if known is not None and known.reason is not reason:
+            # "Lease expired" is what the control plane says if it knows no better.
+            lighter = reason is RemovalReason.LEASE_EXPIRED and known is not None and known.reason is not None
+            if known is not None and known.reason is not reason and not lighter:
                 self._removals[name] = Removal(reason, now)
                 self._removals.move_to_end(name)
-        while len(self._removals) > MAX_REMOVALS:
-            self._removals.popitem(last=False)
+        self._make_room(kept)
+
+    def _make_room(self, kept: Container[NodeName]) -> None:
+        excess = len(self._removals) - MAX_REMOVALS
+        if excess <= 0:
+            return
+        for name in [name for name in self._removals if name not in kept][:excess]:
+            del self._removals[name]
             self._dropped["removal_forgotten"] += 1
 
     def latest(self) -> list[tuple[NodeName, Removal]]:

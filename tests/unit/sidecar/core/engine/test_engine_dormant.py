@@ -84,6 +84,17 @@ def has_lied(sidecar: Sidecar) -> None:
     sidecar.engine.on_link_event(PeerLied(A, SessionId(1)), 1.0)
 
 
+def test_a_dormant_peer_that_another_policy_ends_is_told_with_that_reason() -> None:
+    sidecar = asking()
+    assert [(one.removal.reason, one.kept) for one in sidecar.engine.removed_peers(0.0, 9)] == [
+        (RemovalReason.LEASE_EXPIRED, "dormant")
+    ]
+    falls_under_another_policy(sidecar)
+    assert [(one.removal.reason, one.kept) for one in sidecar.engine.removed_peers(0.0, 9)] == [
+        (RemovalReason.FORBIDDEN, None)
+    ]
+
+
 ENDS = (has_left, falls_under_another_policy, restarts, is_listed_with_a_later_session, has_lied)
 
 

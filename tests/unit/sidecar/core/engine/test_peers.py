@@ -103,8 +103,14 @@ def test_a_dormant_peer_is_forgotten_with_its_policy_or_its_trust() -> None:
     peers = asleep(*HELD, policy=7)
     peers.apply(view(policy=POLICY_PENDING), nobody)
     assert dormant(peers) == [A, B]
-    peers.apply(view(policy=8), nobody)
+    assert peers.all_kept() == {A, B}
+    assert not peers.ended_by_policy
+    peers.apply(view(removed=(RemovedPeer(B, RemovalReason.LEFT),), policy=8), nobody)
     assert dormant(peers) == []
+    assert not peers.all_kept()
+    assert peers.ended_by_policy == frozenset({A})
+    peers.apply(view(policy=8), nobody)
+    assert not peers.ended_by_policy
     own = session_of("robot-1", Role.ROBOT, 99)
     peers = Peers(own, Counter())
     peers.apply(view(*HELD), nobody)
