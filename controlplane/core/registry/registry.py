@@ -10,7 +10,7 @@ import enum
 import heapq
 from collections import OrderedDict
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, NewType
+from typing import TYPE_CHECKING, NamedTuple, NewType
 
 from plr.controlplane.core.overload.postponed import Postponed
 from plr.controlplane.core.overload.registration_share import RegistrationShare
@@ -38,7 +38,8 @@ MAX_REMEMBERED_OFFERS = 1024
 """Service names remembered for one cloud, as many as it may offer at once. Beyond that, only its present offers."""
 
 MAX_REMEMBERED_REMOVALS = 4096
-"""Reasons of removals kept for notices; beyond that the oldest is evicted, and its notice says "lease expired"."""
+"""Reasons of removals kept for notices, and session numbers kept for members whose lease ended; beyond that the oldest
+is evicted, and its notice says "lease expired"."""
 
 
 _PEER_BYTES, _CANDIDATE_BYTES, _OFFER_BYTES = 80, 24, 16
@@ -61,7 +62,7 @@ class Refusal(enum.Enum):
         "another sidecar holds this name, and its lease has not ended: issue a certificate of its own to each node "
         "(plr ca issue); a node that was set up again gets in when the lease has ended"
     )
-    SESSION_TAKEN = "another sidecar has this session number: draw a new one"
+    SESSION_TAKEN = "another sidecar has this session number, or had it when its lease ended: draw a new one"
     FULL = f"{MAX_SIDECARS} sidecars are registered, which is the limit"
     TOO_OFTEN = "it registers too often: check why it keeps restarting or losing its connection"
     NAME_MISMATCH = "the certificate has another name: set name to the certificate's, or leave it out"
@@ -227,6 +228,15 @@ class _Lease:
     """Times postponed since it was last heard."""
 
 
+class _Removal(NamedTuple):
+    """The end of a sidecar's registration."""
+
+    reason: RemovalReason
+    heard_at: float
+    """When it was last heard."""
+    session: SessionId
+
+
 class Registry:
     """All registered sidecars. Times are monotonic seconds."""
 
@@ -236,11 +246,12 @@ class Registry:
         self._leases: dict[NodeName, _Lease] = {}
         self._sidecars: dict[NodeName, Sidecar] = {}
         self._sessions: dict[SessionId, NodeName] = {}
+        """Whose each session number is. One whose lease ended keeps its number, as its peers keep it. With certificates
+        the number follows from the key; without, another that saw it could cut it off by registering with it."""
         self._shares = RegistrationShare()
         self._offering: dict[ServiceName, set[NodeName]] = {}
         """The clouds that offer each service."""
-        self._removals: OrderedDict[NodeName, tuple[RemovalReason, float]] = OrderedDict()
-        """Why each was removed, and when it was last heard."""
+        self._removals: OrderedDict[NodeName, _Removal] = OrderedDict()
         # One entry per name, at the end of its lease at the latest: renewing a lease does not touch it.
         self._ends: list[tuple[float, NodeName]] = []
         self._awaited: set[NodeName] = set()
@@ -272,7 +283,7 @@ class Registry:
                 return self._refuse(Refusal.FULL)
             if not self._shares.take(name, now, new_run=True):
                 return self._refuse(Refusal.TOO_OFTEN)
-            self._removals.pop(name, None)
+            self._forget_removal(name)
             self._sidecars[name] = Sidecar(registration, stream)
             self._leases[name] = _Lease(self.lease_s, now + self.lease_s, now)
             self._sessions[registration.session] = name
@@ -449,20 +460,26 @@ class Registry:
 
     def _remove(self, name: NodeName, reason: RemovalReason) -> None:
         sidecar = self._sidecars.pop(name)
-        del self._sessions[sidecar.registration.session]
+        session = sidecar.registration.session
+        if reason is not RemovalReason.LEASE_EXPIRED:
+            del self._sessions[session]
         self._offers_no_more(sidecar)
         heard_at = self._leases.pop(name).heard_at
         self.counters.departed[reason] += 1
-        self._removals[name] = reason, heard_at
-        self._removals.move_to_end(name)
+        self._removals[name] = _Removal(reason, heard_at, session)
         if len(self._removals) > MAX_REMEMBERED_REMOVALS:
-            self._removals.popitem(last=False)
+            self._forget_removal(next(iter(self._removals)))
             self.counters.removals_forgotten += 1
+
+    def _forget_removal(self, name: NodeName) -> None:
+        removal = self._removals.pop(name, None)
+        if removal is not None and self._sessions.get(removal.session) == name:
+            del self._sessions[removal.session]
 
     def removal_reason(self, name: NodeName) -> RemovalReason:
         """Return why that sidecar is gone; the careful guess for one never known or forgotten is "lease expired"."""
         removed = self._removals.get(name)
-        return RemovalReason.LEASE_EXPIRED if removed is None else removed[0]
+        return RemovalReason.LEASE_EXPIRED if removed is None else removed.reason
 
     def heard_at(self, name: NodeName, now: float) -> float:
         """Return when a sidecar, registered or gone, last said something; `now` for one never known or forgotten."""
@@ -470,7 +487,7 @@ class Registry:
         if lease is not None:
             return lease.heard_at
         removed = self._removals.get(name)
-        return now if removed is None else removed[1]
+        return now if removed is None else removed.heard_at
 
 
 def _tells_anything(registration: Registration, before: Registration) -> bool:

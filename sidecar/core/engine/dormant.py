@@ -41,6 +41,9 @@ class DormantPeers:
         self._most = MAX_DORMANT_SERVERS if role is Role.ROBOT else MAX_PEERS
         self._dropped = dropped
         self._peers: OrderedDict[NodeName, Dormant] = OrderedDict()
+        self._forgotten: dict[NodeName, SessionId] = {}
+        """Those forgotten since `take_forgotten`, which the engine calls after each change."""
+        self._ended: OrderedDict[NodeName, Peer] = OrderedDict()
 
     def __contains__(self, name: object) -> bool:
         return name in self._peers
@@ -62,17 +65,52 @@ class DormantPeers:
         return self._peers.pop(name, None)
 
     def has_session(self, session: SessionId) -> bool:
-        """Return whether this is the session of a dormant peer."""
-        return any(dormant.peer.session == session for dormant in self._peers.values())
+        """Return whether this is the session of a dormant peer, or of one set aside."""
+        held = (*(dormant.peer for dormant in self._peers.values()), *self._ended.values())
+        return any(peer.session == session for peer in held)
 
     def drop(self, over: Callable[[Peer], bool]) -> None:
         """Forget those that may not come back."""
-        for name, dormant in list(self._peers.items()):
+        for dormant in self.all():
             if over(dormant.peer):
-                del self._peers[name]
+                self.forget(dormant.peer.name)
+        for name, peer in list(self._ended.items()):
+            if over(peer):
+                del self._ended[name]
+
+    def forget(self, name: NodeName) -> None:
+        """Forget a dormant peer."""
+        self._forgotten[name] = self._peers.pop(name).peer.session
+
+    def set_aside(self, peer: Peer) -> None:
+        """Remember a peer that is none any more because of its certificate's time, by a clock that may be wrong.
+
+        Links do not know it. Its certificate may be good again when somebody sets the clock.
+        """
+        self._ended[peer.name] = peer
+        self._ended.move_to_end(peer.name)
+        if len(self._ended) > self._most:
+            self._ended.popitem(last=False)
+            self._dropped["dormant_full"] += 1
+
+    def aside(self) -> list[Peer]:
+        """Return those set aside."""
+        return list(self._ended.values())
+
+    def take_aside(self, peer: Peer) -> bool:
+        """Set a peer aside no longer; return False if it was not."""
+        if self._ended.get(peer.name) is not peer:
+            return False
+        del self._ended[peer.name]
+        return True
 
     def make_room(self, awake: int) -> None:
         """Forget those dormant for longest until the rest fit beside `awake` other peers."""
         while len(self._peers) > max(0, min(self._most, MAX_PEERS - awake)):
-            self._peers.popitem(last=False)
+            self.forget(next(iter(self._peers)))
             self._dropped["dormant_full"] += 1
+
+    def take_forgotten(self) -> dict[NodeName, SessionId]:
+        """Return those forgotten since the last call, and their sessions."""
+        forgotten, self._forgotten = self._forgotten, {}
+        return forgotten

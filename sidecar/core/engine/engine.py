@@ -182,7 +182,7 @@ class Engine:
     @property
     def busy(self) -> int:
         """Return the number of requests and messages in flight that somebody still waits for: reasons not to exit."""
-        peers = frozenset(self.peers.names())
+        peers = frozenset(peer.name for peer in self.peers.all_held())
         return self._role.awaited(peers) + sum(self._outbox.messages_to(peer) for peer in peers)
 
     # -- the control plane ----------------------------------------------------------------------------------------
@@ -225,11 +225,16 @@ class Engine:
             self.stats.nacks += 1
             return error
         self.stats.peers_version = self.peers.version
-        self.removals.follow(peer_set, held, now)
+        kept, ended_by_policy = self.peers.all_kept(), self.peers.ended_by_policy
+        self.removals.follow(peer_set, held, now, kept=kept, ended_by_policy=ended_by_policy)
         self.removals.note_dormant(filter(self.peers.is_dormant, before), now)
         self._tell_links_of_peers(peer_set.removed)
         self._role.on_peers_changed(now)
-        ended = [name for name, session in before.items() if self.peers.session(name) != session]
+        for name, session in before.items():
+            if self.peers.is_dormant(name):
+                self._fall_silent(name, session, now)
+        before.update(self.peers.take_forgotten())
+        ended = [name for name, session in before.items() if self.peers.held_session(name) != session]
         for name in ended:
             over = name in self.peers or name in left or name in self.peers.refused
             self._forget_session(name, now, may_return=None if over else before[name])
@@ -251,12 +256,12 @@ class Engine:
         names = self.peers.names()
         path = sum(map(self.peers.is_unlisted, names))
         dormant = len(self.peers.all_held()) - len(names)
-        latest = self.removals.latest()
-        forgotten = sum(
-            removal.at > since and name not in self.peers and not self.peers.is_dormant(name)
-            for name, removal in latest
-        )
-        return RemovedCounts(path, dormant, forgotten, at_least=len(latest) >= MAX_REMOVALS)
+        gone = [
+            removal.at
+            for name, removal in self.removals.latest()
+            if name not in self.peers and not self.peers.is_dormant(name)
+        ]
+        return RemovedCounts(path, dormant, sum(at > since for at in gone), at_least=len(gone) >= MAX_REMOVALS)
 
     def services_of_peers(self) -> set[ServiceName]:
         """Return the services that the peers offer, whatever their names."""
@@ -268,6 +273,7 @@ class Engine:
         gone, taken = self.peers.recheck(), self.peers.readmit(judged)
         self._tell_links_of_peers()
         self._role.on_peers_changed(now)
+        gone += self.peers.take_forgotten()
         for name in gone:
             self._forget_session(name, now)
         self._follow_gone(gone, now)
@@ -304,19 +310,20 @@ class Engine:
         """Take an event of a link."""
         match event:
             case FragmentsReceived(path, session, fragments):
-                if self.peers.session(path.peer) != session:
+                # The link has acknowledged them. A dormant peer may send before we know that a path to it lives.
+                if self.peers.session(path.peer) != session and self.peers.held_session(path.peer) != session:
                     self.stats.dropped["fragment_of_old_session"] += 1
                 else:
                     for arrived in self._inbound.add(path, session, fragments, now):
                         self._on_message(path, arrived, now)
             case MessageAbandoned(peer, session, number):
-                if self.peers.session(peer) == session:
+                if self.peers.held_session(peer) == session:
                     self._inbound.abandon(peer, number)
             case MessageForgotten(peer, number):
                 self._outbox.on_forgotten(peer, number)
             case MessageFinished(peer, number):
                 self._outbox.on_finished(peer, number)
-            case FinishedLost(path, numbers) if path.peer in self.peers:
+            case FinishedLost(path, numbers) if self.peers.held_session(path.peer) is not None:
                 self._inbound.on_finished_lost(path.peer, numbers, self.routes.best_to(path.peer))
             case FragmentsLost():
                 if event.timed_out and (message := self._outbox.under_way(event.message)) is not None:
@@ -344,7 +351,7 @@ class Engine:
                 if self.peers.session(peer) == session:
                     self._on_peer_closed(peer, session, now)
             case PeerLied(peer, session):
-                if self.peers.session(peer) == session:
+                if self.peers.held_session(peer) == session:
                     self.peers.condemn(session)
                     self.recheck_peers((), now)
         self._after_news(now)
@@ -405,18 +412,22 @@ class Engine:
 
     def _lay_down(self, dark: Iterable[NodeName], now: float) -> None:
         """Make those of these peers, whose last path died, dormant that were kept for their paths only."""
-        dormant: dict[NodeName, SessionId | None] = {}
+        silent: dict[NodeName, SessionId] = {}
         for name in dark:
             session = self.peers.session(name)
-            if self.peers.lay_down(name):
-                dormant[name] = session
-        if not dormant:
+            if session is not None and self.peers.lay_down(name):
+                silent[name] = session
+        if not silent:
             return
-        self.removals.note_dormant(dormant, now)
+        self.removals.note_dormant(silent, now)
         self._role.on_peers_changed(now)
-        for name, session in dormant.items():
+        for name, session in silent.items():
+            self._fall_silent(name, session, now)
+        self._role.on_reach_changed(now)
+        forgotten = self.peers.take_forgotten()
+        for name, session in forgotten.items():
             self._forget_session(name, now, may_return=session)
-        self._follow_gone(dormant, now)
+        self._follow_gone(forgotten, now)
         self._links_lag = True
 
     def _on_peer_closed(self, name: NodeName, session: SessionId, now: float) -> None:
@@ -427,8 +438,14 @@ class Engine:
         self._follow_gone((name,), now)
         self._lay_down((name,), now)
 
+    def _fall_silent(self, name: NodeName, session: SessionId, now: float) -> None:
+        """Follow that a peer is dormant. What is under way waits for its return, as if the view still listed it."""
+        self._role.on_session_over(name, now, session)
+        self.revocations.forget_peer(name)
+        self.routes.forget_peer(name)
+
     def _forget_session(self, name: NodeName, now: float, *, may_return: SessionId | None = None) -> None:
-        """End a peer's session; with `may_return` it only fell silent, and may come back with it."""
+        """End a peer's session; with `may_return` nobody said that it is over, and a view may list it again."""
         self._role.on_session_over(name, now, may_return)
         self._inbound.forget_peer(name)
         self.revocations.forget_peer(name)

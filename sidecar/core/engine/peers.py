@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING
 from plr.protos.base.errors import DecodeError
 from plr.protos.model.ids import Role, Version
 from plr.protos.model.members import MAX_PEERS, NO_POLICY, POLICY_PENDING, PeerSet, RemovalReason
-from plr.protos.trust.identity import CertificateError
+from plr.protos.trust.identity import EXPIRED, LIST_TOO_OLD, NOT_YET_VALID, CertificateError
 from plr.sidecar.core.engine.announced import Announced
 from plr.sidecar.core.engine.dormant import Dormant, DormantPeers
 from plr.sidecar.core.engine.verification_budget import VerificationBudget
@@ -30,7 +30,7 @@ from plr.sidecar.core.seam.links import LinkPeer
 
 if TYPE_CHECKING:
     from collections import Counter
-    from collections.abc import Callable, Iterable
+    from collections.abc import Callable, Container, Iterable
 
     from plr.protos.model.ids import Address, InterfaceId, NodeName, ServiceName, SessionId
     from plr.protos.model.members import Peer
@@ -38,6 +38,8 @@ if TYPE_CHECKING:
     from plr.sidecar.core.crypto.session import OwnSession
     from plr.sidecar.core.seam.links import PeerRenewed, PeerRestarted
 
+MATTERS_OF_TIME = frozenset({EXPIRED, NOT_YET_VALID, LIST_TOO_OLD})
+"""Faults of a credential that may be faults of this host's clock."""
 RESTART_GAP_S = 1.0
 """A peer that restarts more often is not believed: every restart costs all links work. The cost of verifying
 credentials that claim a restart has a budget of its own (`verification_budget.py`)."""
@@ -78,6 +80,8 @@ class Peers:
         self._budget = VerificationBudget()
         self._policy = NO_POLICY
         """Fingerprint of the last access policy applied."""
+        self.ended_by_policy: frozenset[NodeName] = frozenset()
+        """The peers that the last view did not list, and that were forgotten because it has another policy."""
         self.version = Version(0)
 
     def __contains__(self, name: object) -> bool:
@@ -99,6 +103,11 @@ class Peers:
         """Return all known peers and the dormant ones, which are judged with them."""
         return [*self._known.values(), *(dormant.peer for dormant in self._dormant.all())]
 
+    def all_kept(self) -> set[NodeName]:
+        """Return the names of those that are kept although the view does not list them, in whatever state."""
+        kept = (*(dormant.peer for dormant in self._dormant.all()), *self._dormant.aside())
+        return self._unlisted.union(peer.name for peer in kept)
+
     def is_unlisted(self, name: NodeName) -> bool:
         """Return whether this is a peer for its living paths only, as the view does not list it."""
         return name in self._unlisted
@@ -112,30 +121,41 @@ class Peers:
         if len(peer_set.peers) > MAX_PEERS:
             return f"{len(peer_set.peers)} peers, the limit is {MAX_PEERS}"
         gone = {removed.name for removed in peer_set.removed if removed.reason is not RemovalReason.LEASE_EXPIRED}
+        new_policy = peer_set.policy not in (POLICY_PENDING, NO_POLICY, self._policy)
+        newest = [(self._newer(listed), listed) for listed in peer_set.peers]
+        proven = {peer.session: peer.name for peer, listed in newest if peer.session != listed.session}
+        if not new_policy:
+            proven |= self._sessions_besides(gone.union(listed.name for listed in peer_set.peers))
         known: dict[NodeName, Peer] = {}
         keys: dict[NodeName, PairKeys] = {}
         refused: dict[NodeName, RefusedPeer] = {}
-        for listed in peer_set.peers:
-            peer = self._newer(listed)
+        for peer, listed in newest:
+            owner = proven.get(peer.session, peer.name)
+            if owner != peer.name:
+                # With certificates the number follows from the key (`credential.verify`). Without, anybody may take it.
+                why = f"it has the session number of {owner}, which proved that the number is its own"
+                refused[peer.name] = RefusedPeer(peer, why, why)
+                self._dropped["session_taken"] += 1
+                continue
             try:
                 keys[peer.name] = self._own.admit(peer)
                 known[peer.name] = self._at_announced(peer, listed)
             except DecodeError as error:
                 refused[peer.name] = RefusedPeer.of(peer, error)
+                self._dropped["bad_credential"] += 1
         # Refused peers do not count: only the control plane vouches for their sessions.
         sessions = {peer.session for peer in known.values()}
         if len(sessions) != len(known):
             return "two peers share a session"
-        if refused:
-            self._dropped["bad_credential"] += len(refused)
         self.refused = refused
         unlisted = set()
-        new_policy = peer_set.policy not in (POLICY_PENDING, NO_POLICY, self._policy)
         over = gone | known.keys() | refused.keys()
 
         def may_not_return(peer: Peer) -> bool:
-            return new_policy or peer.name in over or peer.session in sessions
+            return new_policy or peer.name in over
 
+        others = self._sessions_besides(over).values() if new_policy else ()
+        self.ended_by_policy = frozenset(others)
         self._dormant.drop(may_not_return)
         for name, peer in self._known.items():
             if may_not_return(peer):
@@ -156,6 +176,11 @@ class Peers:
             self._policy = peer_set.policy
         self.version = peer_set.version
         return None
+
+    def _sessions_besides(self, names: Container[NodeName]) -> dict[SessionId, NodeName]:
+        """Return the sessions of all peers that are kept, except those of these names."""
+        kept = (*self.all_held(), *self._dormant.aside())
+        return {peer.session: peer.name for peer in kept if peer.name not in names}
 
     @property
     def ignored_candidates(self) -> dict[NodeName, str]:
@@ -261,38 +286,60 @@ class Peers:
     def recheck(self) -> list[NodeName]:
         """Judge all peers again after a change of trust; return those dropped. See `OwnSession.forget_admitted`.
 
-        Dormant ones that are bad now are forgotten: they were no peers any more.
+        Those that the view does not list are forgotten if they are bad now, or set aside if only their time is over.
         """
-        self._dormant.drop(self._is_bad)
+        for peer in self._dormant.aside():
+            error = self._fault(peer)
+            if error is not None and not _is_matter_of_time(error):
+                self._dormant.take_aside(peer)
+        for peer, _ in self._dormant.all():
+            error = self._fault(peer)
+            if error is not None:
+                self._dropped["bad_credential"] += 1
+                self._dormant.forget(peer.name)
+                self._set_aside(peer, error)
         gone = []
         for name, peer in list(self._known.items()):
-            try:
-                self._own.admit(peer)
-            except DecodeError as error:
+            error = self._fault(peer)
+            if error is not None:
                 self._dropped["bad_credential"] += 1
-                if name not in self._unlisted:
+                if name in self._unlisted:
+                    self._set_aside(peer, error)
+                else:
                     self.refused[name] = RefusedPeer.of(peer, error)
                 self._forget(name)
                 gone.append(name)
         return gone
 
-    def _is_bad(self, peer: Peer) -> bool:
+    def _fault(self, peer: Peer) -> DecodeError | None:
+        """Judge a peer; return what is wrong with its credential."""
         try:
             self._own.admit(peer)
-        except DecodeError:
-            self._dropped["bad_credential"] += 1
-            return True
-        return False
+        except DecodeError as error:
+            return error
+        return None
+
+    def _set_aside(self, peer: Peer, error: DecodeError) -> None:
+        """Remember a peer that the view does not list, and would not bring back, if only its time is over."""
+        if _is_matter_of_time(error):
+            self._dormant.set_aside(peer)
 
     def all_refused(self) -> list[Peer]:
-        """Return the refused peers: a corrected clock or new trust may prove them good."""
-        return [refusal.peer for refusal in self.refused.values()]
+        """Return the refused peers, and those set aside: a corrected clock or new trust may prove them good."""
+        return [*(refusal.peer for refusal in self.refused.values()), *self._dormant.aside()]
 
     def readmit(self, judged: Iterable[Peer]) -> list[NodeName]:
-        """Take refused peers that have just been judged good (`OwnSession.admit`); return those taken."""
+        """Take refused peers that have just been judged good (`OwnSession.admit`); return those taken.
+
+        Those that were set aside are dormant then.
+        """
         taken = []
         sessions = {peer.session for peer in self._known.values()}
         for peer in judged:
+            if self._fault(peer) is None and self._dormant.take_aside(peer):
+                self._dormant.put(Dormant(peer, self._own.admit(peer)))
+                taken.append(peer.name)
+                continue
             refusal = self.refused.get(peer.name)
             # Skip it if a newer view came meanwhile, or another peer has taken its session since.
             if refusal is None or refusal.peer is not peer or peer.session in sessions:
@@ -338,14 +385,26 @@ class Peers:
         return True
 
     def may_call(self, name: NodeName, service: ServiceName) -> bool:
-        """Cloud: return whether the control plane lets this robot call the service here; False if it is unknown."""
-        peer = self._known.get(name)
+        """Cloud: return whether the control plane lets this robot call the service here; False if it is unknown.
+
+        A dormant robot may still call what it was last let call: its request may come before its path is up.
+        """
+        peer = self._known.get(name) or self._held(name)
         return peer is not None and service in peer.may_call
 
     def session(self, name: NodeName) -> SessionId | None:
         """Return a peer's session."""
         peer = self._known.get(name)
         return None if peer is None else peer.session
+
+    def held_session(self, name: NodeName) -> SessionId | None:
+        """Return the session of a peer, dormant or not."""
+        peer = self._held(name)
+        return None if peer is None else peer.session
+
+    def take_forgotten(self) -> dict[NodeName, SessionId]:
+        """Return the dormant peers forgotten since the last call, and their sessions."""
+        return self._dormant.take_forgotten()
 
     def for_links(self) -> tuple[LinkPeer, ...]:
         """Return the peers as links need them, the dormant ones included: links answer them."""
@@ -358,6 +417,10 @@ class Peers:
             told[peer.name] = before
         self._told = told
         return tuple(link_peer for _, _, link_peer in told.values())
+
+
+def _is_matter_of_time(error: DecodeError) -> bool:
+    return isinstance(error, CertificateError) and error.reason in MATTERS_OF_TIME
 
 
 def _link_peer(peer: Peer, keys: PairKeys, era: int, *, dormant: bool) -> LinkPeer:

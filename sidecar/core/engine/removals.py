@@ -9,7 +9,7 @@ from plr.protos.model.members import RemovalReason
 
 if TYPE_CHECKING:
     from collections import Counter
-    from collections.abc import Collection, Iterable
+    from collections.abc import Collection, Container, Iterable
 
     from plr.protos.model.ids import NodeName
     from plr.protos.model.members import PeerSet
@@ -23,7 +23,8 @@ WHY_REMOVED = {
 }
 """Each reason for people."""
 MAX_REMOVALS = 1024
-"""Removed peers that are remembered, one entry for each name; the one removed first is forgotten."""
+"""Removed peers that are remembered, one entry for each name; the one removed first is forgotten. Those that are kept
+all the same (`peers.py`) are always remembered: people ask about them, and they are at most `MAX_PEERS`."""
 
 
 class Removal(NamedTuple):
@@ -44,25 +45,44 @@ class Removals:
         self._dropped = dropped
         self._removals: OrderedDict[NodeName, Removal] = OrderedDict()
 
-    def follow(self, peer_set: PeerSet, held: Collection[NodeName], now: float) -> None:
+    def follow(
+        self,
+        peer_set: PeerSet,
+        held: Collection[NodeName],
+        now: float,
+        *,
+        kept: Container[NodeName] = (),
+        ended_by_policy: Iterable[NodeName] = (),
+    ) -> None:
         """Follow a view that is in force; `held` are the peers, refused ones included, that the view before it listed.
 
-        Others were removed before: a removal that is forgotten would begin again with the time of this view.
+        Others were removed before: a removal that is forgotten would begin again with the time of this view. `kept` are
+        those that are kept though it does not list them, `ended_by_policy` those that were kept, and are not, since the
+        access policy is another one now.
         """
         for peer in peer_set.peers:
             self._removals.pop(peer.name, None)
         listed = {peer.name for peer in peer_set.peers}
         reasons = {removed.name: removed.reason for removed in peer_set.removed}
+        reasons.update(dict.fromkeys(ended_by_policy, RemovalReason.FORBIDDEN))
         for name in held:
             if name not in listed and name not in self._removals:
                 self._removals[name] = Removal(reasons.get(name), now)
         for name, reason in reasons.items():
             known = self._removals.get(name)
-            if known is not None and known.reason is not reason:
+            # "Lease expired" is what the control plane says if it knows no better.
+            lighter = reason is RemovalReason.LEASE_EXPIRED and known is not None and known.reason is not None
+            if known is not None and known.reason is not reason and not lighter:
                 self._removals[name] = known._replace(reason=reason, at=now)
                 self._removals.move_to_end(name)
-        while len(self._removals) > MAX_REMOVALS:
-            self._removals.popitem(last=False)
+        self._make_room(kept)
+
+    def _make_room(self, kept: Container[NodeName]) -> None:
+        if len(self._removals) <= MAX_REMOVALS:
+            return
+        gone = [name for name in self._removals if name not in kept]
+        for name in gone[: max(0, len(gone) - MAX_REMOVALS)]:
+            del self._removals[name]
             self._dropped["removal_forgotten"] += 1
 
     def note_dormant(self, names: Iterable[NodeName], now: float) -> None:

@@ -80,7 +80,11 @@ class EngineRole(Protocol):
         """Send nothing more to a peer that said goodbye."""
 
     def on_session_over(self, peer: NodeName, now: float, may_return: SessionId | None) -> None:
-        """End a peer's session; with `may_return` it only fell silent, and may come back with it."""
+        """End a peer's session; with `may_return` nobody said that it is over, and the peer may come back with it.
+
+        It does so by itself if it is dormant; otherwise if a view lists it again. If a dormant peer is forgotten later,
+        this is called again.
+        """
 
     def on_peer_back(self, peer: NodeName, now: float) -> None:
         """Follow that a peer which fell silent is one again, since a path to it lives."""

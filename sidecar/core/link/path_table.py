@@ -224,8 +224,12 @@ class PathTable:
                 self._enter(path)
         for key, path in list(before.items()):
             known = self.by_session.get(path.session)
-            if path.state is not PathState.DOWN and known is not None and key not in self.paths:
-                # It proves itself, whether the control plane's view is older or newer than what happened here.
+            if known is None or key in self.paths:
+                continue
+            # It proves itself, or is about to, whether the control plane's view is older or newer than what happened
+            # here. A peer that would have to begin again with each view could not come back while views keep changing.
+            begins = path.introductions.awaits_proof(now) and len(self.to(path.peer)) < MAX_PATHS_OF_A_PEER
+            if path.state is not PathState.DOWN or begins:
                 path.set_dormant(now, dormant=known.dormant)
                 self._enter(before.pop(key))
         for path in before.values():

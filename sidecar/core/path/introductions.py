@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, NamedTuple
 
 from plr.sidecar.core.base.timers import NEVER
+from plr.sidecar.core.path.congestion.rtt import LONGEST_ANSWER_S
 
 if TYPE_CHECKING:
     from plr.protos.model.ids import Address
@@ -61,6 +62,10 @@ class Introductions:
     def introducer(self, now: float) -> Address | None:
         """Return the address at which the peer may be because it introduced itself from there more than once."""
         return self._source if now < self._at + INTRODUCER_S else None
+
+    def awaits_proof(self, now: float) -> bool:
+        """Return whether an introduction that found the path down may still lead to an answer that brings it up."""
+        return now < self._at + LONGEST_ANSWER_S
 
     def forget_introducer(self) -> None:
         """Forget where the peer introduced itself from: the path is up."""

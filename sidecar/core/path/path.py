@@ -217,14 +217,14 @@ class Path:
         """Return where probes of `size` bytes that look for the peer go now."""
         others = dict.fromkeys((self.remote, self.introductions.introducer(now)))
         all_of_them = (*(one for one in others if one and one not in self.candidates), *self.candidates)
-        return [one for one in all_of_them if self._may_look_at(one, now, size)]
+        return [one for number, one in enumerate(all_of_them) if self._may_look_at(one, number, now, size)]
 
-    def _may_look_at(self, address: Address, now: float, size: int) -> bool:
+    def _may_look_at(self, address: Address, number: int, now: float, size: int) -> bool:
         if self.address.proven(address):
             return True
         if address == self.remote and address not in self.candidates:
             return (self.address.allowance or 0) >= size
-        return self._unproven.take(now, size)
+        return self.probing.has_turn(number) and self._unproven.take(now, size)
 
     def keeps_address(self, source: Address) -> bool:
         """Return whether to ignore that an authentic datagram came from another known address of the peer.

@@ -7,6 +7,7 @@ other end asks in the datagram with which it answers, and by itself only if it w
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -39,13 +40,15 @@ MAX_DORMANT_PROBE_S = 900.0
 """... or to this at the end that leads, if the peer is dormant (`engine/dormant.py`): it may be dead for good."""
 FREE_ADDRESSES = 16
 """A peer that announces more addresses has all of them probed that much less often until they answer: it gets no more
-datagrams out of us, wherever they lead."""
+datagrams out of us, wherever they lead. Those of a dormant peer that it has proven are exempt: they are few."""
 PROBE_BACKOFF = 1.5
 RETURN_BACKOFF = 1.02
 """A path that was up is likely to come back, and requests may wait for it: its probes are a fiftieth of its downtime
 apart, 0.25 s after ten seconds. Both ends probe, so the wait is mostly half of that or less."""
 DOWN_SPREAD = 0.1
 """As IDLE_SPREAD, for a path that is not up."""
+LONGEST_GAP_S = MAX_DORMANT_PROBE_S / (1 + DOWN_SPREAD)
+"""No two probes of a path are further apart, whatever the spread."""
 MAX_PROBES_OUT = 1024
 """Unanswered probes of either kind that are remembered: those of LONGEST_ANSWER_S, spaced by FIRST_PROBE_S, to a few
 addresses each."""
@@ -77,8 +80,23 @@ class SentPing:
 class Probing:
     """The schedule of one path's probes, and the memory of them. Times in seconds."""
 
-    __slots__ = ("_asked_at", "_asked_every", "_back", "_gap", "_leads", "_out", "_proven_at", "_rng", "_used_at",
-                 "_was_up", "at", "crowd", "dormant", "last_at")  # fmt: skip
+    __slots__ = (
+        "_asked_at",
+        "_asked_every",
+        "_back",
+        "_gap",
+        "_leads",
+        "_out",
+        "_proven_at",
+        "_rng",
+        "_round",
+        "_used_at",
+        "_was_up",
+        "at",
+        "crowd",
+        "dormant",
+        "last_at",
+    )  # fmt: skip
 
     def __init__(self, now: float, rng: random.Random, *, leads: bool) -> None:
         """Create the schedule; `rng` must be unpredictable: who guesses an id could answer a probe he did not get."""
@@ -92,6 +110,7 @@ class Probing:
         self.dormant = False
         """Whether the peer is dormant; see MAX_DORMANT_PROBE_S."""
         self._leads = leads
+        self._round = 0
         self._gap = FIRST_PROBE_S
         self._was_up = False
         self._used_at = now
@@ -168,12 +187,21 @@ class Probing:
 
     def plan_down(self, now: float) -> None:
         """Do as `plan_up` for a path that is down."""
-        self.at = now + self._gap * self._rng.uniform(1 - DOWN_SPREAD, 1 + DOWN_SPREAD)
+        self._round += 1
+        gap = min(self._gap, LONGEST_GAP_S)
+        self.at = now + gap * self._rng.uniform(1 - DOWN_SPREAD, 1 + DOWN_SPREAD)
         backoff = RETURN_BACKOFF if self._was_up else PROBE_BACKOFF
         longest = MAX_PROBE_S if self._leads else MAX_WATCH_PROBE_S
         if self.dormant and self._leads:
-            longest = MAX_DORMANT_PROBE_S
+            longest = LONGEST_GAP_S
         self._gap = min(self._gap * backoff, self._patience * longest)
+
+    def has_turn(self, number: int) -> bool:
+        """Return whether an address that the peer has not proven, the one with this number, is asked this time.
+
+        A dormant peer of many addresses is asked as often as any, but at each time only at some of them.
+        """
+        return (number + self._round) % math.ceil(self._gap / LONGEST_GAP_S) == 0
 
     @property
     def _patience(self) -> float:

@@ -217,8 +217,10 @@ class RobotRole:
         self._goodbyes.note(peer, session)
         self._parts.backlog.add_steps(self._parts.outbox.drop_peer(peer), now)
 
-    def on_session_over(self, peer: NodeName, now: float, _may_return: SessionId | None) -> None:
-        """Drop what was meant for a server whose session is over: nobody answers it."""
+    def on_session_over(self, peer: NodeName, now: float, may_return: SessionId | None) -> None:
+        """Drop what was meant for a server whose session is over: nobody answers it. A dormant server may."""
+        if may_return is not None and self._parts.peers.is_dormant(peer):
+            return
         self._parts.backlog.add_steps(self._parts.outbox.drop_peer(peer), now)
 
     def on_peer_back(self, _peer: NodeName, now: float) -> None:

@@ -34,6 +34,9 @@ class KnownPeers(Protocol):
     def session(self, name: NodeName) -> SessionId | None:
         """Return a peer's session."""
 
+    def is_dormant(self, name: NodeName) -> bool:
+        """Return whether the peer is none at present, and is one again when it talks."""
+
     def may_call(self, name: NodeName, service: ServiceName) -> bool:
         """Cloud: return whether the access policy lets a robot call a service here."""
 

@@ -110,8 +110,7 @@ def test_a_session_number_belongs_to_one_sidecar(registry: Registry) -> None:
     assert registry.register(registration("two", session=7), stream(2), 0.0) is Refusal.SESSION_TAKEN
     registry.register(registration("one", session=8, incarnation=2), stream(3), 0.0)
     assert isinstance(registry.register(registration("two", session=7), stream(2), 0.0), AcceptedRegistration)
-    registry.expire(LEASE_S)
-    assert isinstance(registry.register(registration("three", session=8), stream(4), LEASE_S), AcceptedRegistration)
+    assert registry.register(registration("three", session=8), stream(4), 0.0) is Refusal.SESSION_TAKEN
 
 
 def test_a_sidecar_is_ready_when_it_told_addresses_and_services(registry: Registry) -> None:
@@ -151,6 +150,37 @@ def test_a_full_registry_refuses_newcomers_and_keeps_the_known(
     assert isinstance(registry.register(registration("b", incarnation=2), stream(4), 0.0), AcceptedRegistration)
     assert {sidecar.name for sidecar in registry} == {"a", "b"}
     assert registry.counters.refused[Refusal.FULL] == 1
+
+
+def test_who_lost_its_lease_keeps_its_session_number(registry: Registry) -> None:
+    """Its peers keep it with that number, which is in clear in each datagram."""
+    thief = registration("thief", session=7)
+    registry.register(registration("robot", session=7), stream(1), 0.0)
+    assert len(registry.expire(LEASE_S)) == 1
+    assert registry.register(thief, stream(2), 9.0) is Refusal.SESSION_TAKEN
+    again = registry.register(registration("robot", session=7), stream(3), 9.0)
+    assert again == AcceptedRegistration(None, new_run=True)
+    assert registry.register(thief, stream(2), 9.0) is Refusal.SESSION_TAKEN
+    assert len(registry.expire(99.0)) == 1
+    registry.register(registration("robot", session=8, incarnation=2), stream(4), 99.0)
+    assert isinstance(registry.register(thief, stream(2), 99.0), AcceptedRegistration), "its owner has another one now"
+
+
+@pytest.mark.parametrize("reason", [one for one in RemovalReason if one is not RemovalReason.LEASE_EXPIRED])
+def test_who_is_gone_for_good_gives_its_session_number_back(registry: Registry, reason: RemovalReason) -> None:
+    registry.counters.departed.setdefault(reason, 0)
+    registry.register(registration("robot", session=7), stream(1), 0.0)
+    registry.remove(ROBOT, reason)
+    assert isinstance(registry.register(registration("other", session=7), stream(2), 1.0), AcceptedRegistration)
+
+
+def test_session_numbers_kept_for_the_lost_are_bounded(registry: Registry, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(registry_module, "MAX_REMEMBERED_REMOVALS", 3)
+    for number in range(5):
+        registry.register(registration(f"robot-{number}", session=10 + number), stream(1), float(number))
+    assert len(registry.expire(99.0)) == 5
+    assert len(registry._sessions) == 3
+    assert isinstance(registry.register(registration("other", session=10), stream(2), 99.0), AcceptedRegistration)
 
 
 def test_reasons_of_removals_are_bounded(registry: Registry, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -43,6 +43,9 @@ class Robots:
     def session(self, name: NodeName) -> SessionId | None:
         return SessionId(1) if name in self.names() else None
 
+    def is_dormant(self, name: NodeName) -> bool:
+        return name not in self.names()
+
     def may_call(self, name: NodeName, service: ServiceName) -> bool:
         return (name, service) in self.permits
 

@@ -41,6 +41,30 @@ def test_those_dormant_for_longest_make_room(role: Role, awake: int, kept: int) 
     assert dropped == {"dormant_full": 80 - kept}
 
 
+def test_those_set_aside_are_no_more_than_may_be_dormant() -> None:
+    dropped: Counter[str] = Counter()
+    table = DormantPeers(Role.ROBOT, dropped)
+    for number in range(MAX_DORMANT_SERVERS + 2):
+        table.set_aside(dormant(number).peer)
+    first, *_ = table.aside()
+    assert (first.name, len(table.aside())) == ("n2", MAX_DORMANT_SERVERS)
+    assert dropped == {"dormant_full": 2}
+    assert table.has_session(first.session)
+    assert not table.all()
+    assert table.take_aside(first)
+    assert not table.take_aside(first)
+
+
+def test_who_was_forgotten_is_told_once() -> None:
+    table = DormantPeers(Role.CLOUD, Counter())
+    for number in (1, 2, 3):
+        table.put(dormant(number))
+    table.drop(lambda one: one.name == "n1")
+    table.make_room(MAX_PEERS - 1)
+    assert table.take_forgotten() == {"n1": 2, "n2": 3}
+    assert not table.take_forgotten()
+
+
 def test_a_peer_has_one_entry_which_keeps_its_place() -> None:
     table = DormantPeers(Role.CLOUD, Counter())
     for number in (1, 2):

@@ -23,13 +23,15 @@ from plr.protos.model.members import (
     RemovalReason,
     RemovedPeer,
 )
-from plr.protos.trust.identity import MALFORMED, NOT_YET_VALID, UNTRUSTED, CertificateError
+from plr.protos.trust.identity import EXPIRED, MALFORMED, NOT_YET_VALID, REVOKED, UNTRUSTED, CertificateError
 from plr.sidecar.core.crypto.session import OwnSession
 from plr.sidecar.core.engine.peers import RESTART_GAP_S, Peers
 from plr.sidecar.core.seam.links import PeerRestarted
 from tests.support.builders import ECHO, A, B, peer
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from plr.protos.trust.credential import SessionCredential
 
 OWN = session_of("robot-1", Role.ROBOT, 99)
@@ -79,7 +81,7 @@ def test_a_peer_that_vanished_without_a_path_is_dormant_and_wakes() -> None:
     peers = asleep(*HELD)
     assert dormant(peers) == [A, B]
     assert [one.name for one in peers.all_held()] == [A, B]
-    assert not peers.may_call(A, ECHO)
+    assert peers.may_call(A, ECHO), "it may send before it is known that a path to it lives"
     assert peers.session(A) is None
     assert peers.wake(A)
     assert not peers.wake(A)
@@ -97,15 +99,18 @@ def test_a_dormant_peer_is_forgotten_for_each_reason_but_an_expired_lease(reason
     assert peers.is_dormant(B)
 
 
-def test_a_dormant_peer_is_forgotten_with_its_policy_its_session_or_its_trust() -> None:
+def test_a_dormant_peer_is_forgotten_with_its_policy_or_its_trust() -> None:
     peers = asleep(*HELD, policy=7)
     peers.apply(view(policy=POLICY_PENDING), nobody)
     assert dormant(peers) == [A, B]
-    peers.apply(view(policy=8), nobody)
+    assert peers.all_kept() == {A, B}
+    assert not peers.ended_by_policy
+    peers.apply(view(removed=(RemovedPeer(B, RemovalReason.LEFT),), policy=8), nobody)
     assert dormant(peers) == []
-    peers = asleep(*HELD)
-    peers.apply(view(peer(NodeName("other"), session=1)), nobody)
-    assert dormant(peers) == [B]
+    assert not peers.all_kept()
+    assert peers.ended_by_policy == frozenset({A})
+    peers.apply(view(policy=8), nobody)
+    assert not peers.ended_by_policy
     own = session_of("robot-1", Role.ROBOT, 99)
     peers = Peers(own, Counter())
     peers.apply(view(*HELD), nobody)
@@ -228,11 +233,33 @@ def test_a_peer_cannot_take_the_session_of_another() -> None:
     assert not peers.restarted(restart(session=2), 1.0)
     newcomer = peer("cloud-c", session=9)
     assert peers.restarted(restart(session=9), 1.0)
-    assert "share a session" in (peers.apply(view(*HELD, newcomer), everybody) or "")
-    assert NodeName("cloud-c") not in peers
-    assert peers.session(A) == 9
-    peers.apply(view(peer("cloud-d", session=2)), everybody)
-    assert B not in peers, "kept for its paths, but its session is another's now"
+    assert peers.apply(view(*HELD, newcomer), everybody) is None
+    assert (peers.session(A), peers.names()) == (9, [A, B])
+    why = "it has the session number of cloud-a, which proved that the number is its own"
+    assert [(one.peer, one.why) for one in peers.refused.values()] == [(newcomer, why)]
+    twins = peer("cloud-d", session=5), peer("cloud-e", session=5)
+    assert "share a session" in (peers.apply(view(*HELD, *twins), everybody) or "")
+
+
+@pytest.mark.parametrize("reaches", [everybody, nobody])
+def test_nobody_takes_the_session_of_a_peer_that_the_view_does_not_list(reaches: Callable[[NodeName], bool]) -> None:
+    """Without certificates: it is in clear in each datagram, and free in a control plane that lost the peer."""
+    peers = known(*HELD)
+    thief = peer("cloud-d", session=2)
+    assert peers.apply(view(HELD[0], thief), reaches) is None
+    assert peers.held_session(B) == 2
+    assert list(peers.refused) == [thief.name]
+    assert peers._dropped == {"session_taken": 1}
+    assert peers.readmit(peers.all_refused()) == []
+    peers.apply(view(HELD[0], thief, removed=(RemovedPeer(B, RemovalReason.LEFT),)), reaches)
+    assert (peers.names(), peers.held_session(B)) == ([A, thief.name], None), "the number is nobody's any more"
+
+
+def test_a_peer_in_another_session_leaves_its_earlier_one() -> None:
+    peers = known(*HELD)
+    other = peer("cloud-d", session=2)
+    assert peers.apply(view(HELD[0], peer(B, session=3, incarnation=2), other), nobody) is None
+    assert sorted(peers.names()) == [A, B, other.name]
 
 
 @pytest.mark.audit("sec-4")
@@ -326,6 +353,7 @@ class Judge:
 
 
 EARLY = CertificateError(NOT_YET_VALID, "not valid for another 99 s")
+LATE = CertificateError(EXPIRED, "expired 99 s ago")
 
 
 def test_refused_peers_are_taken_once_they_are_judged_good() -> None:
@@ -359,6 +387,66 @@ def test_one_dropped_when_trust_changed_comes_back_with_its_trust_unless_the_vie
     assert peers.recheck() == [A, B]
     judge.wrong.clear()
     assert peers.readmit(peers.all_refused()) == [A]
+
+
+@pytest.mark.parametrize("reaches", [everybody, nobody])
+def test_a_clock_that_is_wrong_for_a_while_parts_nobody_for_good(reaches: Callable[[NodeName], bool]) -> None:
+    """The view would not bring back a peer that it does not list."""
+    judge = Judge()
+    peers = judge.peers
+    peers.apply(view(*HELD), nobody)
+    peers.apply(view(HELD[0]), reaches)
+    judge.wrong = {B: LATE}
+    judge.own.forget_admitted()
+    for ended in ([B] if reaches is everybody else [], []):
+        assert peers.recheck() == ended
+        assert peers.held_session(B) is None
+    assert B not in peers.refused, "the view does not name it"
+    assert B not in [link_peer.name for link_peer in peers.for_links()]
+    assert peers.readmit(peers.all_refused()) == []
+    assert not peers.restarted(restart(A, session=2), 1.0), "the session is still its own"
+    assert peers.apply(view(HELD[0]), nobody) is None
+    judge.wrong.clear()
+    assert peers.readmit(peers.all_refused()) == [B]
+    assert dormant(peers) == [B]
+    assert peers.readmit([HELD[1]]) == []
+
+
+@pytest.mark.parametrize("error", [CertificateError(REVOKED, "revoked"), DecodeError("it lied")])
+@pytest.mark.parametrize("first", [None, LATE])
+def test_a_dormant_peer_that_is_bad_whatever_the_clock_is_forgotten(
+    error: DecodeError, first: DecodeError | None
+) -> None:
+    judge = Judge()
+    peers = judge.peers
+    peers.apply(view(*HELD), nobody)
+    peers.apply(view(HELD[0]), nobody)
+    for wrong in (first, error):
+        judge.wrong = {} if wrong is None else {B: wrong}
+        judge.own.forget_admitted()
+        peers.recheck()
+    judge.wrong.clear()
+    assert peers.readmit(peers.all_refused()) == []
+    assert peers.all_held() == [HELD[0]]
+
+
+@pytest.mark.parametrize(
+    "newer",
+    [view(policy=8), view(removed=(RemovedPeer(B, RemovalReason.REVOKED),)), view(peer(B, session=5, incarnation=2))],
+    ids=["another policy", "revoked", "listed"],
+)
+def test_one_set_aside_is_forgotten_as_a_dormant_peer_is(newer: PeerSet) -> None:
+    judge = Judge()
+    peers = judge.peers
+    peers.apply(view(*HELD), nobody)
+    peers.apply(view(), nobody)
+    judge.wrong = {B: LATE}
+    judge.own.forget_admitted()
+    peers.recheck()
+    peers.apply(newer, nobody)
+    judge.wrong.clear()
+    assert HELD[1] not in [*peers.all_refused(), *peers.all_held()]
+    assert peers.readmit([HELD[1]]) == []
 
 
 def test_a_refused_peer_is_not_taken_against_what_became_known_since() -> None:

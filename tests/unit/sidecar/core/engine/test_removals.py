@@ -31,6 +31,34 @@ def test_a_later_and_graver_reason_counts() -> None:
     assert removals.latest()[:1] == [(A, Removal(REVOKED, 7.0))]
 
 
+def test_an_expired_lease_is_no_later_news_than_another_reason() -> None:
+    removals = Removals(Counter())
+    removals.follow(view(cloud_a=REVOKED), [A, B], 5.0)
+    removals.follow(view(cloud_a=EXPIRED, cloud_b=EXPIRED), [], 7.0)
+    assert dict(removals.latest()) == {A: Removal(REVOKED, 5.0), B: Removal(EXPIRED, 7.0)}
+
+
+def test_another_policy_is_the_reason_for_which_a_kept_peer_ends() -> None:
+    removals = Removals(Counter())
+    removals.follow(view(cloud_a=EXPIRED), [A, B], 5.0, kept={A, B})
+    removals.follow(view(cloud_a=EXPIRED), [A, B], 7.0, ended_by_policy={A, B})
+    removals.follow(view(cloud_a=EXPIRED), [], 9.0)
+    assert removals.latest() == [(name, Removal(RemovalReason.FORBIDDEN, 7.0)) for name in (B, A)]
+
+
+def test_those_that_are_kept_are_remembered_however_many() -> None:
+    dropped: Counter[str] = Counter()
+    removals = Removals(dropped)
+    kept = {NodeName(f"n{number}") for number in range(MAX_REMOVALS + 3)}
+    removals.follow(view(), sorted(kept), 1.0, kept=kept)
+    gone = [NodeName(f"gone{number}") for number in range(MAX_REMOVALS + 2)]
+    removals.follow(view(), gone, 2.0, kept=kept)
+    assert {name for name, _ in removals.latest()} == {*kept, *gone[2:]}
+    assert dropped == {"removal_forgotten": 2}
+    removals.follow(view(), [A], 3.0, kept=kept - {NodeName("n0")})
+    assert NodeName("n0") not in dict(removals.latest()), "it is the one removed first"
+
+
 def test_nobody_is_remembered_who_was_no_peer() -> None:
     removals = Removals(Counter())
     removals.follow(view(stranger=REVOKED), [A], 5.0)

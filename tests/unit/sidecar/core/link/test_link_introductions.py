@@ -10,6 +10,7 @@ import pytest
 from plr.protos.model.ids import InterfaceId, NodeName
 from plr.sidecar.core.base.values import PathId, PathState
 from plr.sidecar.core.link.path_table import MAX_PATHS_OF_A_PEER, NEW_PATHS, NEW_PATHS_PER_S
+from plr.sidecar.core.path.congestion.rtt import LONGEST_ANSWER_S
 from plr.sidecar.core.path.probing import FIRST_PROBE_S
 from plr.sidecar.core.seam.links import PathChanged, SetCredential, SetPeers
 from plr.sidecar.core.wire import frame
@@ -75,6 +76,42 @@ def test_a_dormant_peer_that_introduces_itself_has_no_path_for_people_until_it_h
     bench.wait(60.0)
     (view,) = bench.link.views(bench.now)
     assert view.state is PathState.DOWN, "a path of a peer is shown when it is down"
+
+
+def begun() -> tuple[Bench, bytes]:
+    """A link that answered the introduction of a peer's new interface, and what that peer answers then."""
+    bench = up()
+    introduce(bench, 0)
+    _, probe, _ = bench.frames(bench.sent())
+    assert isinstance(probe, Probe)
+    answer = bench.datagram(frame.encode_probe_reply(ProbeReply(probe.id)), number=1, interface=NEW_INTERFACE)
+    bench.now += 0.01
+    return bench, answer
+
+
+def test_a_path_that_an_introduction_began_outlives_views_that_do_not_name_it() -> None:
+    bench, answer = begun()
+    bench.know()
+    bench.receive_datagram(answer)
+    assert PathChanged(NEW_PATH, PathState.UP, "answers") in bench.events()
+
+
+def test_a_path_whose_introduction_led_to_nothing_ends_with_the_next_view() -> None:
+    bench, _ = begun()
+    bench.now += LONGEST_ANSWER_S
+    assert NEW_PATH in bench.link.path_ids()
+    bench.know()
+    assert NEW_PATH not in bench.link.path_ids()
+
+
+def test_no_more_paths_that_introductions_began_outlive_a_view_than_a_peer_may_have() -> None:
+    bench = up()
+    for number in range(MAX_PATHS_OF_A_PEER):
+        introduce(bench, number, interface=InterfaceId(100 + number))
+        bench.sent()
+    more = tuple((InterfaceId(number), (PEER_ADDRESS,)) for number in range(4))
+    bench.execute(SetPeers((bench.link_peer(addresses=more),)))
+    assert len(bench.link.path_ids()) == MAX_PATHS_OF_A_PEER
 
 
 def test_an_introduction_is_answered_where_it_came_from_in_fewer_bytes_and_moves_nothing() -> None:

@@ -194,6 +194,20 @@ def test_probes_go_to_every_candidate_until_the_path_is_up() -> None:
     assert destinations(subject) == (THERE,)
 
 
+def test_a_dormant_peer_is_asked_each_time_where_it_proved_to_be() -> None:
+    subject = new()
+    subject.announced((HERE, THERE), 64)
+    subject.address.prove(HERE)
+    subject.probing.dormant = True
+    now, asked = 100.0, []
+    while now < 100.0 + 30 * 86_400.0:
+        asked.append(subject.destinations(now, 100))
+        subject.plan_probe(now)
+        now = subject.probe_at
+    assert all(HERE in addresses for addresses in asked)
+    assert [THERE in addresses for addresses in asked[-8:]].count(True) == 2
+
+
 def test_after_a_rebinding_every_candidate_is_asked_until_one_answers() -> None:
     subject = up()
     subject.address.move(ELSEWHERE, 100.0)

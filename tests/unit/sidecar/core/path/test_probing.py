@@ -7,7 +7,6 @@ import pytest
 
 from plr.sidecar.core.path.congestion.rtt import LONGEST_ANSWER_S
 from plr.sidecar.core.path.probing import (
-    DOWN_SPREAD,
     FIRST_PROBE_S,
     FREE_ADDRESSES,
     IDLE_PROBE_S,
@@ -146,7 +145,7 @@ def test_a_dormant_peer_is_asked_a_fiftieth_of_its_downtime_apart_and_ever_less_
         subject.plan_down(subject.at)
     after = [at - 100.0 for at in asked]
     assert all(gap < 0.03 * at + 0.1 for at, gap in zip(after[1:], _gaps(after), strict=True))
-    assert max(_gaps(after)) <= MAX_DORMANT_PROBE_S * (1 + DOWN_SPREAD)
+    assert 0.9 * MAX_DORMANT_PROBE_S < max(_gaps(after)) <= MAX_DORMANT_PROBE_S
     assert sum(at < 3600.0 for at in after) < 500
     assert sum(at > 6 * 86_400.0 for at in after) < 1.2 * 86_400.0 / MAX_DORMANT_PROBE_S
 
@@ -163,6 +162,25 @@ def test_who_does_not_lead_looks_for_a_dormant_peer_as_for_any_other() -> None:
 
 def _gaps(times: list[float]) -> list[float]:
     return [later - at for at, later in itertools.pairwise(times)]
+
+
+@pytest.mark.parametrize("times", [4, 8])
+def test_a_dormant_peer_of_many_addresses_is_asked_no_more_rarely_but_only_at_some_of_them(times: int) -> None:
+    subject = up()
+    subject.dormant, subject.crowd = True, times * FREE_ADDRESSES
+    subject.begin_again(100.0)
+    asked: dict[int, list[float]] = {}
+    longest = 0.0
+    while subject.at < 100.0 + 30 * 86_400.0:
+        now = subject.at
+        for number in filter(subject.has_turn, range(subject.crowd)):
+            asked.setdefault(number, []).append(now)
+        subject.plan_down(now)
+        longest = max(longest, subject.at - now)
+    assert 0.9 * MAX_DORMANT_PROBE_S < longest <= MAX_DORMANT_PROBE_S
+    assert [at[0] for at in asked.values()] == [100.0] * subject.crowd, "all of them at first"
+    last = [at[-1] - at[-2] for at in asked.values()]
+    assert sum(last) / len(last) == pytest.approx(times * MAX_DORMANT_PROBE_S, rel=0.15)
 
 
 @pytest.mark.parametrize("was_up", [False, True])
