@@ -143,7 +143,7 @@ def test_a_clock_that_is_wrong_for_two_seconds_does_not_part_it_from_its_peers(w
 
 
 def test_a_member_cannot_take_the_place_of_a_lost_one() -> None:
-    """It asks the control plane of the cloud for the session number that it saw, and has a certificate of its own."""
+    """Without certificates: it registers with the session number that it saw."""
     trial = Trial()
     thief = trial.mesh.add("thief", Role.ROBOT, ["wlan0"], (rule(),))
     trial.lose(trial.robot)

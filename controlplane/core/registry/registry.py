@@ -246,8 +246,8 @@ class Registry:
         self._leases: dict[NodeName, _Lease] = {}
         self._sidecars: dict[NodeName, Sidecar] = {}
         self._sessions: dict[SessionId, NodeName] = {}
-        """Whose each session number is. One whose lease ended keeps its number, as its peers keep it: all can see the
-        number in its datagrams, and another must not cut it off by registering with it."""
+        """Whose each session number is. One whose lease ended keeps its number, as its peers keep it. With certificates
+        the number follows from the key; without, another that saw it could cut it off by registering with it."""
         self._shares = RegistrationShare()
         self._offering: dict[ServiceName, set[NodeName]] = {}
         """The clouds that offer each service."""

@@ -132,7 +132,7 @@ class Peers:
         for peer, listed in newest:
             owner = proven.get(peer.session, peer.name)
             if owner != peer.name:
-                # Whoever sees a datagram sees its session number. The control plane does not know whose it is.
+                # With certificates the number follows from the key (`credential.verify`). Without, all can claim it.
                 why = f"it has the session number of {owner}, which proved that the number is its own"
                 refused[peer.name] = RefusedPeer(peer, why, why)
                 self._dropped["session_taken"] += 1

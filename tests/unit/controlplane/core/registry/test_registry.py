@@ -153,7 +153,7 @@ def test_a_full_registry_refuses_newcomers_and_keeps_the_known(
 
 
 def test_who_lost_its_lease_keeps_its_session_number(registry: Registry) -> None:
-    """Its peers keep it with that number, which each of them sees."""
+    """Its peers keep it with that number, which is in clear in each datagram."""
     thief = registration("thief", session=7)
     registry.register(registration("robot", session=7), stream(1), 0.0)
     assert len(registry.expire(LEASE_S)) == 1

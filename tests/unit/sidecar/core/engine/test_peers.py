@@ -243,7 +243,7 @@ def test_a_peer_cannot_take_the_session_of_another() -> None:
 
 @pytest.mark.parametrize("reaches", [everybody, nobody])
 def test_nobody_takes_the_session_of_a_peer_that_the_view_does_not_list(reaches: Callable[[NodeName], bool]) -> None:
-    """It is in clear in each datagram, and free in a control plane that lost the peer."""
+    """Without certificates: it is in clear in each datagram, and free in a control plane that lost the peer."""
     peers = known(*HELD)
     thief = peer("cloud-d", session=2)
     assert peers.apply(view(HELD[0], thief), reaches) is None
