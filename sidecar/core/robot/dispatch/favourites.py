@@ -2,9 +2,10 @@
 
 Shared requests stay at one server while it answers. Another one would begin with paths about which less is known, over
 the same networks. A server may be bad although its paths are up: its own network is slow, or it answers nothing. So
-after some missed deadlines in a row, a late request also goes to another server. The favourite had a head start, so
-whoever answers first is better. Under overload no server is better, and the paths to another one take capacity from
-those in use. So the time between two tries doubles with each try that is not answered by its deadline.
+after some missed deadlines without any answer, or many without one in time, a late request also goes to another server.
+The favourite had a head start, so whoever answers first is better. Under overload no server is better, and the paths to
+another one take capacity from those in use. So the time between two tries doubles with each try that is not answered by
+its deadline.
 """
 
 from __future__ import annotations
@@ -22,7 +23,9 @@ if TYPE_CHECKING:
     from plr.sidecar.core.transfer.routes import Routes
 
 MISSES = 8
-"""Another server is tried after so many missed deadlines in a row: under overload, some requests are in time."""
+"""Another server is tried after so many missed deadlines without any answer: under overload, answers come late ..."""
+LATE_MISSES = 40
+"""... or after so many without an answer in time."""
 FIRST_WAIT_S = 0.25
 """The second try of another server comes this long (s) after the first, which comes at once ..."""
 LONGEST_WAIT_S = 8.0
@@ -34,8 +37,10 @@ class _Favourite:
     server: NodeName
     chosen: bool = False
     """It took the place of another one, and keeps it although the mapping may not name it."""
+    unanswered: int = 0
+    """Missed deadlines since its last answer ..."""
     misses: int = 0
-    """Missed deadlines since the last answer in time."""
+    """... and since its last answer in time."""
     next_try_at: float = 0.0
     wait_s: float = FIRST_WAIT_S
 
@@ -92,12 +97,15 @@ class Favourites:
         """Note that a request missed its deadline while it was only at this server, and the path to it is up."""
         favourite = self._favourites.get(service)
         if favourite is not None and favourite.server == server:
+            favourite.unanswered += 1
             favourite.misses += 1
 
     def may_try(self, service: ServiceName, now: float) -> bool:
         """Return whether it is time to find out whether another server is better than the favourite."""
         favourite = self._favourites.get(service)
-        return favourite is not None and favourite.misses >= MISSES and now >= favourite.next_try_at
+        if favourite is None or now < favourite.next_try_at:
+            return False
+        return favourite.unanswered >= MISSES or favourite.misses >= LATE_MISSES
 
     def tried(self, service: ServiceName, now: float) -> None:
         """Note that a request went to another server as well, or in place of the favourite."""
@@ -116,6 +124,8 @@ class Favourites:
         if favourite is None:
             return
         server = copy.path.peer
+        if favourite.server == server:
+            favourite.unanswered = 0
         if now - copy.sent_at > deadline_s:
             return
         if favourite.server != server and any(
@@ -127,5 +137,5 @@ class Favourites:
 
     def move(self, service: ServiceName, to: NodeName) -> None:
         """Make another server the favourite."""
-        favourite = self._favourites[service]
-        favourite.server, favourite.chosen, favourite.misses = to, True, 0
+        before = self._favourites[service]
+        self._favourites[service] = _Favourite(to, chosen=True, next_try_at=before.next_try_at, wait_s=before.wait_s)

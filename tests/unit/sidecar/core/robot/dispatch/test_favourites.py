@@ -6,7 +6,7 @@ import pytest
 
 from plr.protos.model.ids import NodeName
 from plr.sidecar.core.base.values import PathState
-from plr.sidecar.core.robot.dispatch.favourites import FIRST_WAIT_S, LONGEST_WAIT_S, MISSES, Favourites
+from plr.sidecar.core.robot.dispatch.favourites import FIRST_WAIT_S, LATE_MISSES, LONGEST_WAIT_S, MISSES, Favourites
 from plr.sidecar.core.robot.request.mapping_table import MappingTable
 from plr.sidecar.core.robot.request.request import Copy
 from plr.sidecar.core.transfer.routes import Routes
@@ -101,6 +101,15 @@ def test_another_server_is_tried_after_misses_of_the_favourite_in_a_row(favourit
     assert favourites.may_try(ECHO, 1.0)
     favourites.move(ECHO, B)
     assert not favourites.may_try(ECHO, 1.0)
+
+
+def test_a_favourite_that_answers_late_is_tried_against_another_after_more_misses(favourites: Favourites) -> None:
+    favourites.choose(ECHO, (A, B), to(A, B))
+    for number in range(LATE_MISSES):
+        assert not favourites.may_try(ECHO, 1.0)
+        favourites.missed(ECHO, A)
+        favourites.answered(ECHO, copy(A, float(number)), [], DEADLINE_S, number + 2.0)
+    assert favourites.may_try(ECHO, 1.0)
 
 
 def test_the_time_between_tries_doubles_until_an_answer_in_time(favourites: Favourites) -> None:
