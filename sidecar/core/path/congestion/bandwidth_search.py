@@ -12,8 +12,9 @@ from plr.sidecar.core.path.congestion.units import DATAGRAM_BYTES, END_HOST_S
 if TYPE_CHECKING:
     from plr.sidecar.core.path.congestion.delivery_rate import DeliveryRate
 
-CYCLE = (1.25, 0.75, 1.0, 1.0, 1.0, 1.0, 1.0, 1.0)
-"""Pacing gains round by round: send more, drain what that queued, cruise (BBR's ProbeBW)."""
+CYCLE = (1.25, 0.75, 1.0, 1.0)
+"""Pacing gains round by round: send more, drain what that queued, cruise (after BBR's ProbeBW, whose cycle has twice as
+many rounds: radio links change their rate within a second)."""
 CRUISING = 2
 """Position in the cycle at which a path begins whose rate was just found."""
 PROBE_GROWTH = 1.1
