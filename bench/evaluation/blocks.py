@@ -93,7 +93,7 @@ def _beside_oracle(found: Mapping[str, Mapping[str, Any]]) -> str:
     ours, least = (found[name]["miss_ratio"] for name in (SUREST, ORACLE))
     times = f" This is {least / ours * 100:.0f} % of what `{SUREST}` misses." if ours else ""
     return (
-        "\nThe oracle is computed. It knows what each path will carry, and splits every request between both paths. "
+        "\n`oracle` is computed, too. It knows what each path will carry, and splits every request between both paths. "
         f"It misses {_percent(least)}.{times}"
     )
 
