@@ -168,7 +168,8 @@ def _repeats(outcomes: Sequence[Outcome], again: Measured | None) -> list[Sectio
             "Repeated",
             "A second evaluation ran the same windows. A gain is the mean or P99 of the better direct run, divided by "
             "that of the contender. Only windows in which a direct run misses a request count. Rows with "
-            "`median` show the median of the gains in these windows, the other rows with `gain` their geometric mean. Gains over the worse use the worse direct run instead.",
+            "`median` show the median of the gains in these windows, the other rows with `gain` their geometric mean. "
+            "Gains over the worse use the worse direct run instead.",
             (),
             (repeats.table(repeats.compare(Measured.of(outcomes), again)),),
         )
