@@ -52,7 +52,7 @@ LEAST_PROBES = 5.0
 USELESS_AFTER_S = 60.0
 """Time for which an interface has to be of no use, or of use again, before it counts as that."""
 
-LOOK_EVERY_S = 2.0
+LOOK_EVERY_S = 10.0
 """Least time between two looks at a robot: one takes up to a millisecond for the largest tables."""
 
 MAX_PATHS_LOOKED_AT = 512
