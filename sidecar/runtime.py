@@ -14,7 +14,7 @@ from plr.protos.base.errors import StartError
 from plr.protos.base.host_port import split_host_port
 from plr.protos.model.ids import OLDEST_PROTOCOL_VERSION, PROTOCOL_VERSION, Role, ServiceName, Version
 from plr.protos.model.mapping import MappingSet
-from plr.protos.model.members import MAX_UNMET, CandidateKind, PeerSet, Registration, ServiceSet
+from plr.protos.model.members import MAX_UNMET, CandidateKind, Registration, ServiceSet
 from plr.protos.model.stream import ResourceKind
 from plr.protos.program import interpreter
 from plr.protos.program.notifier import Notifier
@@ -42,7 +42,7 @@ if TYPE_CHECKING:
 
     from plr.protos.model.ids import InterfaceName, NodeName
     from plr.protos.model.mapping import Assignment
-    from plr.protos.model.members import Candidate
+    from plr.protos.model.members import Candidate, PeerSet
     from plr.protos.model.stream import Welcome
     from plr.protos.program.metrics_server import MetricsServer
     from plr.protos.program.tls_files import TlsFiles
@@ -183,10 +183,7 @@ class SidecarRuntime:
         self._interfaces.set_stun_servers(self._stun_servers(last.welcome))
         self._interfaces.start()
         if last.peers is not None:
-            problem = self._data_plane.apply_peers(last.peers)
-            self._restore(Apply(ResourceKind.PEERS, last.peers), problem)
-            if problem is None and self._store.kept_peers is not None:
-                self._data_plane.restore_kept(self._store.kept_peers, last.peers)
+            self._restore(Apply(ResourceKind.PEERS, last.peers), self._data_plane.apply_peers(last.peers))
         if last.mapping is not None:
             problem = self._data_plane.apply_mapping(last.mapping)
             self._restore(Apply(ResourceKind.MAPPING, last.mapping), problem)
@@ -356,9 +353,6 @@ class SidecarRuntime:
 
     def applied(self, content: PeerSet | MappingSet) -> None:
         """Remember what is in force, and log what a mapping changes."""
-        if isinstance(content, PeerSet):
-            # First, so that no restart finds a view without a peer, and not that the peer is kept.
-            self._store.remember_kept_peers(*self._data_plane.kept_peers())
         self._store.remember(content)
         if isinstance(content, MappingSet):
             self._mapping_origin = MappingOrigin("control plane", time.monotonic())

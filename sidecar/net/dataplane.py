@@ -13,7 +13,6 @@ import time
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from plr.protos.model.members import MAX_PEERS
 from plr.sidecar.core.base.values import PathState
 from plr.sidecar.core.engine.engine import Engine, EngineConfig
 from plr.sidecar.core.link.pinging import Pong
@@ -29,7 +28,7 @@ if TYPE_CHECKING:
 
     from plr.protos.model.ids import InterfaceName, NodeName, ServiceName, SessionId
     from plr.protos.model.mapping import MappingSet, ServiceMapping
-    from plr.protos.model.members import Peer, PeerSet, ServiceOffer, ServiceUse
+    from plr.protos.model.members import PeerSet, ServiceOffer, ServiceUse
     from plr.protos.model.report import Report
     from plr.protos.trust.credential import SessionCredential
     from plr.sidecar.core.base.report_scope import ReportScope
@@ -212,17 +211,6 @@ class ThreadedDataPlane:
         if error is None:
             self._hooks.reach_changed()
         return error
-
-    def kept_peers(self) -> tuple[tuple[Peer, ...], int]:
-        """Return the peers that are kept although the view does not list them, and the policy under which they are."""
-        with self._lock:
-            return tuple(self._engine.peers.all_kept()[:MAX_PEERS]), self._engine.peers.policy
-
-    def restore_kept(self, kept: PeerSet, peer_set: PeerSet) -> None:
-        """Take the peers that an earlier run kept besides this view of that run, which is in force."""
-        self.peer_trust.judge(kept.peers)
-        with self._turn as (engine, now):
-            engine.restore_kept(kept, peer_set, now)
 
     def renew_credential(self, credential: SessionCredential) -> None:
         """Use this session's credential, signed with our renewed certificate.

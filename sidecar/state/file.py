@@ -49,7 +49,6 @@ MAX_STATE_FILE_BYTES = 64 << 20
 
 _IDENTITY_MAGIC = b"plr-id\0\0"
 _LAST_GOOD_MAGIC = b"plr-last"
-_KEPT_MAGIC = b"plr-kept"
 _ADDRESSES_MAGIC = b"plr-ctrl"
 _REVOCATIONS_MAGIC = b"plr-crls"
 _CLOCK_MAGIC = b"plr-clck"
@@ -114,35 +113,18 @@ def decode_identity(data: bytes) -> SavedIdentity:
 
 def encode_last_good(last: LastGood) -> bytes:
     """Return the file's content."""
-    return _seal(_LAST_GOOD_MAGIC, _messages(last), LAST_GOOD_VERSION)
-
-
-def encode_kept_peers(last: LastGood) -> bytes:
-    """Return the file's content; `last` has nothing but peers, those kept although the view does not list them."""
-    return _seal(_KEPT_MAGIC, _messages(last))
-
-
-def _messages(last: LastGood) -> bytes:
     owner = last.owner.encode()
     parts = [bytes([len(owner)]), owner]
     for message in (last.welcome, last.peers, last.mapping):
         if message is not None:
             data = control_message_to_proto(message).SerializeToString(deterministic=True)
             parts += [_LENGTH.pack(len(data)), data]
-    return b"".join(parts)
+    return _seal(_LAST_GOOD_MAGIC, b"".join(parts), LAST_GOOD_VERSION)
 
 
 def decode_last_good(data: bytes, owner: NodeName) -> LastGood:
     """Read the file's content; raises DecodeError, even if only another sidecar wrote it."""
-    return _pull_messages(_open(_LAST_GOOD_MAGIC, data, LAST_GOOD_VERSION), owner)
-
-
-def decode_kept_peers(data: bytes, owner: NodeName) -> LastGood:
-    """Read the file's content; raises DecodeError, even if only another sidecar wrote it."""
-    return _pull_messages(_open(_KEPT_MAGIC, data), owner)
-
-
-def _pull_messages(body: bytes, owner: NodeName) -> LastGood:
+    body = _open(_LAST_GOOD_MAGIC, data, LAST_GOOD_VERSION)
     if not body:
         raise DecodeError("no owner")
     end = 1 + body[0]

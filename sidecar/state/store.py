@@ -19,8 +19,7 @@ from collections import Counter
 from typing import TYPE_CHECKING, TypeVar
 
 from plr.protos.base.errors import DecodeError
-from plr.protos.model.ids import Version
-from plr.protos.model.members import TOKEN_BYTES, PeerSet
+from plr.protos.model.members import TOKEN_BYTES
 from plr.protos.program.own_folder import OwnFolder
 from plr.protos.program.regular_file import open_regular
 from plr.sidecar.state.file import (
@@ -31,30 +30,26 @@ from plr.sidecar.state.file import (
     decode_addresses,
     decode_clock_floor,
     decode_identity,
-    decode_kept_peers,
     decode_last_good,
     decode_revocations,
     encode_addresses,
     encode_clock_floor,
     encode_identity,
-    encode_kept_peers,
     encode_last_good,
     encode_revocations,
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    from collections.abc import Callable
     from pathlib import Path
 
     from plr.protos.model.ids import Address, NodeName
-    from plr.protos.model.members import Peer
     from plr.protos.model.stream import ControlMessage
 
 log = logging.getLogger(__name__)
 
 IDENTITY_FILE = "identity"
 LAST_GOOD_FILE = "last-good"
-KEPT_PEERS_FILE = "kept-peers"
 ADDRESSES_FILE = "control-addresses"
 REVOCATIONS_FILE = "revocations"
 CLOCK_FILE = "clock-floor"
@@ -64,7 +59,6 @@ SET_ASIDE_SUFFIX = ".refused"
 FAILURES = (
     "identity_refused",
     "last_good_refused",
-    "kept_peers_refused",
     "control_addresses_refused",
     "revocations_refused",
     "clock_floor_refused",
@@ -107,9 +101,6 @@ class StateStore:
         self._current = self._read(LAST_GOOD_FILE, lambda data: decode_last_good(data, owner)) or LastGood(owner)
         self.last_good = self._current
         """As found on disk when opened."""
-        self._kept = self._read(KEPT_PEERS_FILE, lambda data: decode_kept_peers(data, owner)) or LastGood(owner)
-        self.kept_peers = self._kept.peers
-        """The peers that an earlier run kept although its view did not list them, as found on disk when opened."""
         self._addresses = self._read(ADDRESSES_FILE, decode_addresses) or ControlAddresses(())
         self.revocations = self._read(REVOCATIONS_FILE, decode_revocations) or b""
         """Revocation lists (PEM) as found on disk when opened."""
@@ -127,16 +118,6 @@ class StateStore:
             if changed != self._current:
                 self._current = changed
                 self._dirty[LAST_GOOD_FILE] = changed
-                self._condition.notify()
-
-    def remember_kept_peers(self, peers: Sequence[Peer], policy: int) -> None:
-        """Keep the peers that are kept under this policy although the view does not list them; return at once."""
-        with self._condition:
-            before = self._kept.peers
-            known = ((), policy) if before is None else (tuple(before.peers), before.policy)
-            if known != (tuple(peers), policy):
-                self._kept = LastGood(self._owner, peers=PeerSet(Version(0), 0, tuple(peers), policy=policy))
-                self._dirty[KEPT_PEERS_FILE] = self._kept
                 self._condition.notify()
 
     def control_addresses(self, names: tuple[str, ...]) -> tuple[Address, ...]:
@@ -193,7 +174,9 @@ class StateStore:
                 closing = self._closing
                 dirty, self._dirty = self._dirty, {}
             failed = {
-                name: content for name, content in dirty.items() if not self._write(name, _encoded(name, content))
+                name: content
+                for name, content in dirty.items()
+                if not self._write(name, encode_last_good(content) if isinstance(content, LastGood) else content)
             }
             with self._condition:
                 if closing and failed:
@@ -240,12 +223,6 @@ class StateStore:
             self._failing.remove(name)
             log.info("%s is written to the disk again", self._folder.path / name)
         return True
-
-
-def _encoded(name: str, content: bytes | LastGood) -> bytes:
-    if isinstance(content, bytes):
-        return content
-    return encode_kept_peers(content) if name == KEPT_PEERS_FILE else encode_last_good(content)
 
 
 def peek_last_good(folder: Path, owner: NodeName) -> LastGood:

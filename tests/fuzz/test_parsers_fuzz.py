@@ -125,7 +125,6 @@ def test_damaged_messages(kind: str, fuzz_datagrams: int) -> None:
 FILES: dict[str, tuple[bytes, Callable[[bytes], object]]] = {
     "identity": (b"plr-id\0\0", file.decode_identity),
     "last good": (b"plr-last", lambda data: file.decode_last_good(data, OWNER)),
-    "kept peers": (b"plr-kept", lambda data: file.decode_kept_peers(data, OWNER)),
     "addresses": (b"plr-ctrl", file.decode_addresses),
     "revocations": (b"plr-crls", file.decode_revocations),
     "clock": (b"plr-clck", file.decode_clock_floor),

@@ -219,27 +219,6 @@ def test_a_robot_that_restarts_in_the_dark_is_answered() -> None:
     assert trial.cloud.engine.peers.session(trial.robot.name) == trial.robot.session
 
 
-@pytest.mark.parametrize("dark_s", [0.0, 20.0])
-@pytest.mark.parametrize("who", ["robot", "cloud"])
-def test_the_other_end_may_restart_too(who: str, dark_s: float) -> None:
-    """Its disk has the view, which does not list the lost one, and whom it kept besides."""
-    trial = Trial()
-    lost = getattr(trial, who)
-    trial.lose(lost)
-    trial.dark(dark_s)
-    other = trial.other_end(lost)
-    view, peers = trial.planes.peer_sets[other.name], other.engine.peers
-    assert lost.name not in [peer.name for peer in view.peers]
-    kept = replace(view, peers=tuple(peers.all_kept()), policy=peers.policy)
-    other.start()
-    assert other.engine.apply_peers(view, trial.mesh.now) is None
-    other.engine.restore_kept(kept, view, trial.mesh.now)
-    trial.mesh.pump(other)
-    trial.planes.run(3 * SOON_S)
-    assert trial.is_answered()
-    assert other.engine.peers.is_unlisted(lost.name)
-
-
 @pytest.mark.parametrize("who", ["robot", "cloud"])
 def test_a_dormant_peer_costs_next_to_nothing(who: str) -> None:
     trial = Trial()

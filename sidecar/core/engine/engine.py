@@ -225,7 +225,7 @@ class Engine:
             self.stats.nacks += 1
             return error
         self.stats.peers_version = self.peers.version
-        kept, ended_by_policy = self._names_kept(), self.peers.ended_by_policy
+        kept, ended_by_policy = self.peers.all_kept(), self.peers.ended_by_policy
         self.removals.follow(peer_set, held, now, kept=kept, ended_by_policy=ended_by_policy)
         self.removals.note_dormant(filter(self.peers.is_dormant, before), now)
         self._tell_links_of_peers(peer_set.removed)
@@ -241,16 +241,6 @@ class Engine:
         self._follow_gone(ended, now)
         self._role.on_view(left | self.peers.refused.keys(), now)
         return None
-
-    def restore_kept(self, kept: PeerSet, peer_set: PeerSet, now: float) -> None:
-        """Take the peers that an earlier run kept besides this view of that run, which is in force."""
-        self.peers.restore(kept, peer_set)
-        names = self._names_kept()
-        self.removals.follow(peer_set, names, now, kept=names)
-        self._tell_links_of_peers()
-
-    def _names_kept(self) -> set[NodeName]:
-        return {peer.name for peer in self.peers.all_kept()}
 
     def removed_peers(self, since: float, at_most: int) -> list[RemovedPeerView]:
         """Return the peers that the control plane removed after `since` (s), the last one first; kept ones always."""

@@ -103,15 +103,10 @@ class Peers:
         """Return all known peers and the dormant ones, which are judged with them."""
         return [*self._known.values(), *(dormant.peer for dormant in self._dormant.all())]
 
-    def all_kept(self) -> list[Peer]:
-        """Return those that are kept although the view does not list them, in whatever state."""
-        dormant = (one.peer for one in self._dormant.all())
-        return [*(self._known[name] for name in sorted(self._unlisted)), *dormant, *self._dormant.aside()]
-
-    @property
-    def policy(self) -> int:
-        """Return the fingerprint of the access policy under which peers are kept."""
-        return self._policy
+    def all_kept(self) -> set[NodeName]:
+        """Return the names of those that are kept although the view does not list them, in whatever state."""
+        kept = (*(dormant.peer for dormant in self._dormant.all()), *self._dormant.aside())
+        return self._unlisted.union(peer.name for peer in kept)
 
     def is_unlisted(self, name: NodeName) -> bool:
         """Return whether this is a peer for its living paths only, as the view does not list it."""
@@ -181,29 +176,6 @@ class Peers:
             self._policy = peer_set.policy
         self.version = peer_set.version
         return None
-
-    def restore(self, kept: PeerSet, peer_set: PeerSet) -> None:
-        """Take the peers that an earlier run kept, besides the view of that run, which was applied already.
-
-        They are dormant. `apply` says which of them may not return.
-        """
-        pending = peer_set.policy == POLICY_PENDING
-        if not pending and peer_set.policy not in (NO_POLICY, kept.policy):
-            return
-        if pending:
-            self._policy = kept.policy
-        gone = {removed.name for removed in peer_set.removed if removed.reason is not RemovalReason.LEASE_EXPIRED}
-        over = gone | self._known.keys() | self.refused.keys()
-        for peer in kept.peers:
-            if peer.name in over or self._has_session(peer.session):
-                continue
-            error = self._fault(peer)
-            if error is None:
-                self._dormant.put(Dormant(peer, self._own.admit(peer)))
-            else:
-                self._dropped["bad_credential"] += 1
-                self._set_aside(peer, error)
-        self._dormant.make_room(len(self._known))
 
     def _sessions_besides(self, names: Container[NodeName]) -> dict[SessionId, NodeName]:
         """Return the sessions of all peers that are kept, except those of these names."""

@@ -34,7 +34,6 @@ from plr.sidecar.state.store import (
     ADDRESSES_FILE,
     CLOCK_FILE,
     IDENTITY_FILE,
-    KEPT_PEERS_FILE,
     LAST_GOOD_FILE,
     REVOCATIONS_FILE,
     StateDirError,
@@ -184,27 +183,6 @@ def test_only_changes_are_written(tmp_path: Path) -> None:
     assert (after.st_ino, after.st_mtime_ns) == (before.st_ino, before.st_mtime_ns)
 
 
-def test_peers_that_no_view_lists_are_found_again_and_written_only_when_they_change(tmp_path: Path) -> None:
-    store = StateStore(tmp_path, OWNER)
-    store.remember_kept_peers((), 7)
-    store = reopen(store, tmp_path)
-    assert store.kept_peers is None
-    assert not (tmp_path / KEPT_PEERS_FILE).exists(), "most sidecars never lose one"
-    store.remember_kept_peers(PEERS.peers, 7)
-    store = reopen(store, tmp_path)
-    kept = store.kept_peers
-    assert kept is not None
-    assert (kept.peers, kept.policy) == (PEERS.peers, 7)
-    before = (tmp_path / KEPT_PEERS_FILE).stat()
-    store.remember_kept_peers(PEERS.peers, 7)
-    store = reopen(store, tmp_path)
-    assert (tmp_path / KEPT_PEERS_FILE).stat().st_mtime_ns == before.st_mtime_ns
-    store.remember_kept_peers((), 8)
-    kept = reopen(store, tmp_path).kept_peers
-    assert kept is not None
-    assert (kept.peers, kept.policy) == ((), 8)
-
-
 def test_files_are_for_the_owner_only(tmp_path: Path) -> None:
     store = StateStore(tmp_path / "state", OWNER)
     store.remember(PEERS)
@@ -242,13 +220,12 @@ def test_a_folder_that_cannot_be_made_is_an_error(tmp_path: Path) -> None:
         lambda data: bytes(len(data)),
     ],
 )
-@pytest.mark.parametrize("name", [IDENTITY_FILE, LAST_GOOD_FILE, KEPT_PEERS_FILE])
+@pytest.mark.parametrize("name", [IDENTITY_FILE, LAST_GOOD_FILE])
 def test_a_spoilt_file_is_set_aside_and_counted_and_the_sidecar_starts(
     tmp_path: Path, caplog: pytest.LogCaptureFixture, name: str, spoil: Callable[[bytes], bytes]
 ) -> None:
     store = StateStore(tmp_path, OWNER)
     store.remember(PEERS)
-    store.remember_kept_peers(PEERS.peers, 7)
     store.close()
     path = tmp_path / name
     spoilt = spoil(path.read_bytes())
@@ -259,7 +236,6 @@ def test_a_spoilt_file_is_set_aside_and_counted_and_the_sidecar_starts(
     assert f"{path} is refused" in caplog.text
     assert (tmp_path / f"{name}.refused").read_bytes() == spoilt
     assert (store.last_good == LastGood(OWNER)) == (name == LAST_GOOD_FILE)
-    assert (store.kept_peers is None) == (name == KEPT_PEERS_FILE)
     assert len(store.identity.token) == 16
 
 

@@ -20,7 +20,6 @@ from plr.sidecar.core.seam.links import (
     Resend,
     Send,
     SendFinished,
-    SetPeers,
 )
 from plr.sidecar.core.wire.frame import Fragment
 from plr.sidecar.core.wire.messages import RequestMessage, ResponseMessage, encode_message
@@ -121,18 +120,6 @@ def test_a_listed_server_that_was_dormant_goes_on() -> None:
     commands, events = sidecar.take()
     assert [type(command) for command in commands].count(Resend) == 1
     assert not [event for event in events if isinstance(event, RequestFailed)]
-
-
-def test_peers_that_an_earlier_run_kept_are_dormant_and_told_with_the_reason() -> None:
-    sidecar = cloud()
-    lost = PeerSet(Version(2), 1, (), (RemovedPeer(B, RemovalReason.LEASE_EXPIRED),))
-    assert sidecar.engine.apply_peers(lost, 0.2) is None
-    sidecar.take()
-    sidecar.engine.restore_kept(PeerSet(Version(1), 1, (peer(B, session=2),)), lost, 0.3)
-    (told,) = (command for command in sidecar.take()[0] if isinstance(command, SetPeers))
-    assert [one.name for one in told.peers if one.dormant] == [B]
-    removed = sidecar.engine.removed_peers(0.0, 9)
-    assert (B, RemovalReason.LEASE_EXPIRED, "dormant") in [(one.name, one.removal.reason, one.kept) for one in removed]
 
 
 def silent_cloud() -> Sidecar:
