@@ -33,7 +33,8 @@ EVENTS_PER_S = 1.0 / 30.0
 """Rate after that; each event is written to the disk."""
 
 PRESENCE_BURST, PRESENCE_PER_S = 8.0, 0.1
-"""Further events of one member that say whether it is present: these must not be missing after a restart."""
+"""Further events of one member that say whether it is present: these must not be missing after a restart. They come
+first, so that a stream that ends all the time leaves the share for other events."""
 
 
 class EventMemory:
@@ -76,7 +77,7 @@ class EventMemory:
                 TokenBucket(rate=EVENTS_PER_S, burst=EVENTS_BURST, now=now),
                 TokenBucket(rate=PRESENCE_PER_S, burst=PRESENCE_BURST, now=now),
             )
-        return share[0].take(now) or (presence and share[1].take(now))
+        return (presence and share[1].take(now)) or share[0].take(now)
 
     def add(self, event: FleetEvent) -> None:
         """Keep an event whose number is above all others'."""

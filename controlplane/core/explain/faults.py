@@ -56,10 +56,11 @@ LOOK_EVERY_S = 10.0
 """Least time between two looks at a robot: one takes up to a millisecond for the largest tables."""
 
 MAX_PATHS_LOOKED_AT = 512
-"""Paths, and blocks, of one robot that are looked at."""
+"""Paths, and blocks, of one robot that are looked at; of the paths, as many over each interface."""
 
 MAX_WATCHED_INTERFACES = 256
-"""Interfaces of one robot that are watched; the others are counted as left out, and have no faults."""
+"""Interfaces of one robot that are watched. Beyond that, one that is well and did not come or go lately is forgotten. If
+there is none, the others are counted as left out, and have no faults."""
 
 
 @dataclass(slots=True)
@@ -75,6 +76,10 @@ class _Watch:
     """Since when it has been of no use, or of use, other than `useless` says."""
     texts: dict[Fault, str] = field(default_factory=dict)
     """Details of the faults that it has."""
+
+    def is_calm(self, now: float) -> bool:
+        """Return whether nothing is wrong with it, and it did not come or go lately."""
+        return not self.texts and (not self.links or self.links[-1] < now - FLAP_WINDOW_S)
 
 
 @dataclass(slots=True)
@@ -152,14 +157,14 @@ class Faults:
         """
         known = self._robots.setdefault(robot, _Robot(now))
         known.looked_at = now
-        looked_at = dict(islice(paths.items(), MAX_PATHS_LOOKED_AT))
+        looked_at = _some_of_each_interface(paths)
         changes, known.restless = _changes(looked_at, now - FLAP_WINDOW_S)
         misses = _misses(islice(blocks, MAX_PATHS_LOOKED_AT))
         useless = _useless(looked_at, misses, now)
         found: list[FaultChange] = []
-        for interface in {**changes, **known.interfaces}:
-            if (watch := self._watch(robot, interface, now)) is None:
-                continue
+        for interface in changes:
+            self._watch(robot, interface, now)
+        for interface, watch in known.interfaces.items():
             count = max(changes.get(interface, 0), sum(at >= now - FLAP_WINDOW_S for at in watch.links))
             found += _judge_flapping(interface, watch, count)
             found += _judge_useless(interface, watch, useless.get(interface), now)
@@ -170,10 +175,29 @@ class Faults:
         watch = known.interfaces.get(interface)
         if watch is None:
             if len(known.interfaces) >= MAX_WATCHED_INTERFACES:
-                self.left_out += 1
-                return None
+                calm = next((name for name, one in known.interfaces.items() if one.is_calm(now)), None)
+                if calm is None:
+                    self.left_out += 1
+                    return None
+                del known.interfaces[calm]
             watch = known.interfaces[interface] = _Watch()
         return watch
+
+
+def _some_of_each_interface(
+    paths: Mapping[tuple[InterfaceName, NodeName], PathRecord],
+) -> Mapping[tuple[InterfaceName, NodeName], PathRecord]:
+    """Return at most about MAX_PATHS_LOOKED_AT of the paths, as many over each interface."""
+    if len(paths) <= MAX_PATHS_LOOKED_AT:
+        return paths
+    left = dict.fromkeys((interface for interface, _ in paths), 0)
+    most = max(1, MAX_PATHS_LOOKED_AT // len(left))
+    chosen = {}
+    for key, path in paths.items():
+        if left[key[0]] < most:
+            left[key[0]] += 1
+            chosen[key] = path
+    return chosen
 
 
 def _judge_flapping(interface: InterfaceName, watch: _Watch, count: int) -> list[FaultChange]:

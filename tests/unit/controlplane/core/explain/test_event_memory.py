@@ -85,3 +85,12 @@ def test_the_last_ones_come_the_oldest_first() -> None:
         memory.add(event(number, "robot"))
     assert [one.number for one in memory.last(2)] == [4, 5]
     assert [one.number for one in memory.last(9)] == [1, 2, 3, 4, 5]
+
+
+def test_a_stream_that_ends_all_the_time_leaves_room_for_other_events() -> None:
+    memory = EventMemory()
+    admitted = 0
+    for number in range(300):
+        memory.admits("flapping", 20.0 * number, presence=True)
+        admitted += memory.admits("flapping", 20.0 * number + 10.0) if number % 3 == 0 else 0
+    assert admitted == 100

@@ -10,6 +10,7 @@ from plr.controlplane.core.explain.faults import (
     FLAP_WINDOW_S,
     FLAPS,
     LOOK_EVERY_S,
+    MAX_PATHS_LOOKED_AT,
     MAX_WATCHED_INTERFACES,
     USELESS_AFTER_S,
     Faults,
@@ -188,5 +189,30 @@ def test_a_robot_that_names_ever_new_interfaces_is_watched_up_to_a_limit() -> No
     names = [InterfaceName(f"if{number}") for number in range(MAX_WATCHED_INTERFACES + 10)]
     faults.note_links(ROBOT, names, 0.0)
     assert faults.left_out == 10
+    later = FLAP_WINDOW_S + 1.0
+    for number in range(FLAPS):
+        faults.note_links(ROBOT, [InterfaceName("wwan0")], later + number)
+    assert faults.left_out == 10, "those that came and went long ago make room"
+    (found,) = faults.look(ROBOT, {}, (), later + FLAPS)
+    assert (found.found.interface, found.found.fault) == ("wwan0", Fault.FLAPPING)
+
+
+def test_many_paths_over_one_interface_do_not_hide_another_one() -> None:
+    fleet = Fleet()
+    record = fleet.world.core.estimator
+    fleet.reports(fine("wlan0", "a"), fine("wwan0", "a"))
+    for number in range(2 * FLAPS):
+        fleet.reports(fine("wwan0", "a", up=bool(number % 2)))
+    states = record.path_states(ROBOT)
+    steady, flapping = (states[InterfaceName(nic), NodeName("a")] for nic in ("wlan0", "wwan0"))
+    paths = {(InterfaceName("wlan0"), NodeName(f"s{number}")): steady for number in range(MAX_PATHS_LOOKED_AT)}
+    paths[InterfaceName("wwan0"), NodeName("a")] = flapping
+    found = Faults().look(ROBOT, paths, (), fleet.world.now)
+    assert [one.found.interface for one in found] == ["wwan0"]
+
+
+def test_a_robot_is_looked_at_now_and_then() -> None:
+    faults = Faults()
+    faults.look(ROBOT, {}, (), 0.0)
     assert faults.look(ROBOT, {}, (), LOOK_EVERY_S) == []
     assert not faults.is_due(ROBOT, LOOK_EVERY_S + 0.1)
