@@ -59,8 +59,8 @@ MAX_PATHS_LOOKED_AT = 512
 """Paths, and blocks, of one robot that are looked at; of the paths, as many over each interface."""
 
 MAX_WATCHED_INTERFACES = 256
-"""Interfaces of one robot that are watched. Beyond that, one that is well and did not come or go lately is forgotten. If
-there is none, the others are counted as left out, and have no faults."""
+"""Interfaces of one robot that are watched. Beyond that, one that is well and did not come or go lately is forgotten.
+If there is none, the others are counted as left out, and have no faults."""
 
 
 @dataclass(slots=True)
