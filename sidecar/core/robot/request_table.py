@@ -363,6 +363,21 @@ class RequestTable:
         if copies:
             self._backlog.add(lambda: (partial(self._on_copy_dead, *each) for each in copies), now)
 
+    def on_peer_dormant(self, peer: NodeName, now: float) -> None:
+        """End the copies at a dormant server of requests that may run twice and send nothing while a copy is awaited.
+
+        All other requests wait for its return, and ask other servers meanwhile as their mode says.
+        """
+        stuck = [
+            (request, copy)
+            for request, copy in self._requests.copies_at(peer)
+            if copy.state is CopyState.PENDING and request.rule.idempotent and not request.rule.redundancy.helps
+        ]
+        for _, copy in stuck:
+            self._parts.outbox.drop(copy.message)
+        if stuck:
+            self._backlog.add(lambda: (partial(self._on_copy_dead, *each) for each in stuck), now)
+
     def _on_copy_dead(self, request: Request, copy: Copy, now: float) -> None:
         copy.session_over = True
         if copy.state is not CopyState.PENDING:

@@ -220,6 +220,7 @@ class RobotRole:
     def on_session_over(self, peer: NodeName, now: float, may_return: SessionId | None) -> None:
         """Drop what was meant for a server whose session is over: nobody answers it. A dormant server may."""
         if may_return is not None and self._parts.peers.is_dormant(peer):
+            self.requests.on_peer_dormant(peer, now)
             return
         self._parts.backlog.add_steps(self._parts.outbox.drop_peer(peer), now)
 

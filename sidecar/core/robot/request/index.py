@@ -94,6 +94,10 @@ class RequestIndex:
         """Return the requests that had a copy sent over this path."""
         return list(self._by_path.get(path, {}).values())
 
+    def copies_at(self, server: NodeName) -> list[tuple[Request, Copy]]:
+        """Return all copies sent to a server."""
+        return list(self._by_server.get(server, {}).values())
+
     def take_copies_at(self, server: NodeName) -> list[tuple[Request, Copy]]:
         """Return all copies sent to a server whose session is over, and forget that they were sent there."""
         return list(self._by_server.pop(server, {}).values())
