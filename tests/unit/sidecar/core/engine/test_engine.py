@@ -336,7 +336,7 @@ def test_a_cloud_that_drains_waits_only_for_what_is_awaited() -> None:
 
 
 def dormant(sidecar: Sidecar) -> list[NodeName]:
-    """The dormant peers that links were just told of."""
+    """The dormant peers that links know, as they were given last."""
     told = [command for command in sidecar.take()[0] if isinstance(command, SetPeers)]
     return [peer.name for peer in told[-1].peers if peer.dormant] if told else []
 
